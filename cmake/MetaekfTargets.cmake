@@ -1,0 +1,31 @@
+# One library per folder, one line per test: the only helpers the build files use.
+
+add_library(metaekf_warnings INTERFACE)
+target_compile_options(metaekf_warnings INTERFACE
+  -Wall -Wextra -Werror -Wshadow -Wnon-virtual-dtor -Wno-missing-field-initializers)
+
+# metaekf_library(core_filter SOURCES a.cc b.cc DEPS metaekf::core_base Eigen3::Eigen)
+# makes target metaekf_core_filter with alias metaekf::core_filter.
+function(metaekf_library name)
+  cmake_parse_arguments(ARG "" "" "SOURCES;DEPS;PRIVATE_DEPS" ${ARGN})
+  add_library(metaekf_${name} STATIC ${ARG_SOURCES})
+  add_library(metaekf::${name} ALIAS metaekf_${name})
+  target_include_directories(metaekf_${name} PUBLIC ${PROJECT_SOURCE_DIR})
+  target_link_libraries(metaekf_${name} PUBLIC ${ARG_DEPS} PRIVATE ${ARG_PRIVATE_DEPS} metaekf_warnings)
+endfunction()
+
+# metaekf_test(core/filter/ekf_test.cc DEPS metaekf::core_filter LABELS slow)
+# makes and registers the test core.filter.ekf_test.
+function(metaekf_test source)
+  cmake_parse_arguments(ARG "" "TIMEOUT" "DEPS;LABELS" ${ARGN})
+  string(REGEX REPLACE "\\.cc$" "" name ${source})
+  string(REPLACE "/" "." name ${name})
+  add_executable(${name} ${source})
+  target_link_libraries(${name} PRIVATE ${ARG_DEPS} GTest::gmock GTest::gtest_main metaekf_warnings)
+  set_target_properties(${name} PROPERTIES RUNTIME_OUTPUT_DIRECTORY ${CMAKE_BINARY_DIR}/tests)
+  add_test(NAME ${name} COMMAND ${name})
+  if(NOT ARG_TIMEOUT)
+    set(ARG_TIMEOUT 120)
+  endif()
+  set_tests_properties(${name} PROPERTIES TIMEOUT ${ARG_TIMEOUT} LABELS "${ARG_LABELS}")
+endfunction()
