@@ -1,0 +1,39 @@
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+namespace metaekf::autodiff {
+
+/// Elementwise functions σ(z). `a` is the parameter where a function has one.
+enum class Activation : uint8_t {
+  kIdentity,   // z
+  kRelu,       // max(z, 0)
+  kLeakyRelu,  // z, z ≥ 0; a z, z < 0
+  kElu,        // z, z ≥ 0; a (eᶻ − 1), z < 0
+  kSelu,       // λ ELU(z), the constants of Klambauer et al. (2017)
+  kTanh,
+  kSwish,     // z / (1 + e^{−z})
+  kMish,      // z tanh(log(1 + eᶻ))
+  kSoftplus,  // log(1 + eᶻ)
+};
+
+/// The highest derivative that Apply knows: a curl-free output takes one derivative, its loss's
+/// gradient another, the Hessian–vector product a third.
+inline constexpr int kMaxDerivative = 3;
+
+/// Whether σ has continuous derivatives of all orders.
+bool IsSmooth(Activation activation);
+
+/// Whether the derivative of this order is zero everywhere (where it exists).
+bool DerivativeIsZero(Activation activation, int order);
+
+/// The parameter `a` that a function has by default (0 where it has none).
+double DefaultParameter(Activation activation);
+
+/// out_i = σ^(order)(z_i), i < count; in place is allowed. At the kink of a piecewise function the
+/// derivative is the right one. order must be 0 … kMaxDerivative.
+template <typename T>
+void ApplyActivation(Activation activation, int order, T a, const T* z, T* out, size_t count);
+
+}  // namespace metaekf::autodiff

@@ -1,0 +1,221 @@
+#include "core/autodiff/evaluate.h"
+
+#include <algorithm>
+#include <cstring>
+#include <new>
+
+#include "core/autodiff/kernels.h"
+
+namespace metaekf::autodiff {
+namespace {
+
+constexpr std::align_val_t kAlignment{128};
+
+template <typename T>
+class Machine {
+ public:
+  Machine(const Program& program, T* const* slots, Workspace<T>* workspace) : program_(program) {
+    bases_ = slots;
+    arena_ = workspace->arena();
+    constants_ = workspace->constants();
+  }
+
+  void Run() {
+    for (const Instruction& i : program_.instructions) {
+      if (i.op != Opcode::kLoop) {
+        Execute(i, 0);
+        continue;
+      }
+      const Loop& loop = program_.loops[static_cast<size_t>(i.loop)];
+      for (int64_t step = 0; step < loop.length; ++step) {
+        const int64_t t = loop.reverse ? loop.length - 1 - step : step;
+        for (const Instruction& inner : loop.instructions) Execute(inner, t);
+      }
+    }
+  }
+
+ private:
+  T* At(const Operand& operand, int64_t t) const {
+    T* base = operand.slot >= 0 ? bases_[operand.slot] : operand.slot == Operand::kArena ? arena_ : constants_;
+    return base + operand.offset + t * operand.step_stride;
+  }
+
+  /// out = function(a, b) elementwise; at most one of the two is tiled.
+  template <typename Function>
+  void Binary(const Instruction& i, int64_t t, Function function) const {
+    T* out = At(i.out, t);
+    const T* a = At(i.a, t);
+    const T* b = At(i.b, t);
+    if (i.a.tile_width == 0 && i.b.tile_width == 0) {
+      const int64_t size = int64_t{i.rows} * i.cols;
+      for (int64_t k = 0; k < size; ++k) out[k] = function(a[k], b[k]);
+    } else if (i.b.tile_width != 0) {
+      ForEachTile(i, i.b, [&](int64_t at, int64_t from, int64_t size) {
+        for (int64_t k = 0; k < size; ++k) out[at + k] = function(a[at + k], b[from + k]);
+      });
+    } else {
+      ForEachTile(i, i.a, [&](int64_t at, int64_t from, int64_t size) {
+        for (int64_t k = 0; k < size; ++k) out[at + k] = function(a[from + k], b[at + k]);
+      });
+    }
+  }
+
+  /// Calls visit(place in the result, place in the tiled operand, elements) for every tile.
+  template <typename Visit>
+  static void ForEachTile(const Instruction& i, const Operand& tiled, Visit visit) {
+    const int64_t size = int64_t{i.rows} * tiled.tile_width;
+    const int64_t blocks = i.cols / (int64_t{tiled.tile_width} * tiled.tile_count);
+    int64_t at = 0;
+    for (int64_t block = 0; block < blocks; ++block) {
+      for (int32_t repeat = 0; repeat < tiled.tile_count; ++repeat, at += size) visit(at, block * size, size);
+    }
+  }
+
+  void Copy(const Instruction& i, const Operand& from, int64_t t) const {
+    T* out = At(i.out, t);
+    const T* a = At(from, t);
+    if (from.tile_width == 0) {
+      if (out != a) std::memcpy(out, a, sizeof(T) * static_cast<size_t>(int64_t{i.rows} * i.cols));
+    } else {
+      ForEachTile(i, from, [&](int64_t at, int64_t source, int64_t size) {
+        std::memcpy(out + at, a + source, sizeof(T) * static_cast<size_t>(size));
+      });
+    }
+  }
+
+  void Product(const Instruction& i, int64_t t, bool accumulate) const {
+    MatMul(i.transpose_a, i.transpose_b, i.rows, i.cols, i.inner, At(i.a, t), i.a.ld, At(i.b, t), i.b.ld, At(i.out, t),
+           i.out.ld, accumulate);
+  }
+
+  void Execute(const Instruction& i, int64_t t) const {
+    switch (i.op) {
+      case Opcode::kCopy:
+        return Copy(i, i.a, t);
+      case Opcode::kFill: {
+        T* out = At(i.out, t);
+        std::fill(out, out + int64_t{i.rows} * i.cols, T(i.scalar));
+        return;
+      }
+      case Opcode::kMatMul:
+        return Product(i, t, false);
+      case Opcode::kMatMulAdd:
+        Copy(i, i.c, t);
+        return Product(i, t, true);
+      case Opcode::kAdd:
+        return Binary(i, t, [](T a, T b) { return a + b; });
+      case Opcode::kSub:
+        return Binary(i, t, [](T a, T b) { return a - b; });
+      case Opcode::kMul:
+        return Binary(i, t, [](T a, T b) { return a * b; });
+      case Opcode::kScale:
+        return Scaled(i, T(i.scalar), At(i.a, t), t);
+      case Opcode::kScaleBy:
+        return Scaled(i, *At(i.a, t), At(i.b, t), t);
+      case Opcode::kDot:
+        return Dot(i, t);
+      case Opcode::kActivation:
+        return ApplyActivation(i.activation, i.order, T(i.scalar), At(i.a, t), At(i.out, t),
+                               static_cast<size_t>(int64_t{i.rows} * i.cols));
+      case Opcode::kSumTiles:
+        return SumTiles(i, t);
+      case Opcode::kCopyRows: {
+        T* out = At(i.out, t) + i.first;
+        const T* a = At(i.a, t);
+        for (int32_t col = 0; col < i.cols; ++col) {
+          std::copy_n(a + int64_t{col} * i.a.ld, i.rows, out + int64_t{col} * i.out.ld);
+        }
+        return;
+      }
+      case Opcode::kSliceRows: {
+        T* out = At(i.out, t);
+        const T* a = At(i.a, t) + i.first;
+        for (int32_t col = 0; col < i.cols; ++col) {
+          std::copy_n(a + int64_t{col} * i.a.ld, i.rows, out + int64_t{col} * i.out.ld);
+        }
+        return;
+      }
+      case Opcode::kLoop:
+        return;  // loops do not nest
+    }
+  }
+
+  void Scaled(const Instruction& i, T factor, const T* a, int64_t t) const {
+    T* out = At(i.out, t);
+    const int64_t size = int64_t{i.rows} * i.cols;
+    for (int64_t k = 0; k < size; ++k) out[k] = factor * a[k];
+  }
+
+  /// Sums in blocks, so that long sums in float keep their digits.
+  void Dot(const Instruction& i, int64_t t) const {
+    const T* a = At(i.a, t);
+    const T* b = At(i.b, t);
+    const int64_t size = int64_t{i.rows} * i.cols;
+    double sum = 0;
+    for (int64_t begin = 0; begin < size; begin += 64) {
+      const int64_t end = std::min(size, begin + 64);
+      T partial = 0;
+      for (int64_t k = begin; k < end; ++k) partial += a[k] * b[k];
+      sum += static_cast<double>(partial);
+    }
+    *At(i.out, t) = static_cast<T>(sum);
+  }
+
+  void SumTiles(const Instruction& i, int64_t t) const {
+    T* out = At(i.out, t);
+    const T* a = At(i.a, t);
+    const int64_t size = int64_t{i.rows} * i.width;
+    const int64_t blocks = i.cols / (int64_t{i.width} * i.count);
+    for (int64_t block = 0; block < blocks; ++block) {
+      T* sum = out + block * size;
+      std::copy_n(a, size, sum);
+      a += size;
+      for (int32_t repeat = 1; repeat < i.count; ++repeat, a += size) {
+        for (int64_t k = 0; k < size; ++k) sum[k] += a[k];
+      }
+    }
+  }
+
+  const Program& program_;
+  T* const* bases_;
+  T* arena_;
+  T* constants_;
+};
+
+}  // namespace
+
+template <typename T>
+void Workspace<T>::Free::operator()(T* memory) const {
+  ::operator delete[](memory, kAlignment);
+}
+
+template <typename T>
+std::unique_ptr<T[], typename Workspace<T>::Free> Workspace<T>::Allocate(int64_t elements) {
+  const size_t bytes = sizeof(T) * static_cast<size_t>(std::max<int64_t>(elements, 1));
+  return std::unique_ptr<T[], Free>(static_cast<T*>(::operator new[](bytes, kAlignment)));
+}
+
+template <typename T>
+Workspace<T>::Workspace(const Program& program)
+    : arena_(Allocate(program.arena_size)), constants_(Allocate(program.constants_size)) {
+  for (const Program::ConstantBlock& block : program.constants) {
+    T* target = constants_.get() + block.offset;
+    if (block.data) {
+      std::copy(block.data->begin(), block.data->end(), target);
+    } else {
+      std::fill(target, target + block.size, static_cast<T>(block.scalar));
+    }
+  }
+}
+
+template <typename T>
+void Evaluate(const Program& program, const Slots<T>& slots, Workspace<T>* workspace) {
+  Machine<T>(program, slots.data(), workspace).Run();
+}
+
+template class Workspace<float>;
+template class Workspace<double>;
+template void Evaluate(const Program&, const Slots<float>&, Workspace<float>*);
+template void Evaluate(const Program&, const Slots<double>&, Workspace<double>*);
+
+}  // namespace metaekf::autodiff

@@ -1,0 +1,81 @@
+#include "core/autodiff/activation.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <vector>
+
+namespace metaekf::autodiff {
+namespace {
+
+constexpr Activation kAll[] = {Activation::kIdentity, Activation::kRelu,  Activation::kLeakyRelu,
+                               Activation::kElu,      Activation::kSelu,  Activation::kTanh,
+                               Activation::kSwish,    Activation::kMish,  Activation::kSoftplus};
+
+double Value(Activation activation, int order, double z, double a) {
+  double out;
+  ApplyActivation(activation, order, a, &z, &out, 1);
+  return out;
+}
+
+// Values of PyTorch 1.13's modules in double at z = 0.7 and −1.3 (relu, leaky_relu(0.01), elu(1), selu, tanh, silu,
+// mish, softplus).
+TEST(ActivationTest, ValuesMatchPyTorch) {
+  const struct {
+    Activation activation;
+    double positive, negative;
+  } expected[] = {
+      {Activation::kRelu, 0.7, 0},
+      {Activation::kLeakyRelu, 0.7, -0.013},
+      {Activation::kElu, 0.7, -0.7274682069659875},
+      {Activation::kTanh, 0.6043677771171635, -0.8617231593133063},
+  };
+  for (const auto& e : expected) {
+    EXPECT_NEAR(Value(e.activation, 0, 0.7, DefaultParameter(e.activation)), e.positive, 1e-15);
+    EXPECT_NEAR(Value(e.activation, 0, -1.3, DefaultParameter(e.activation)), e.negative, 1e-15);
+  }
+}
+
+// Identities that define the functions: swish z·s(z), softplus log(1 + eᶻ), mish z·tanh(softplus z), with
+// SELU's published constants.
+TEST(ActivationTest, ValuesMatchTheirDefinitions) {
+  for (const double z : {-3.0, -0.4, 0.0, 0.9, 4.0}) {
+    const double softplus = std::log(1 + std::exp(z));
+    EXPECT_NEAR(Value(Activation::kSwish, 0, z, 0), z / (1 + std::exp(-z)), 1e-15);
+    EXPECT_NEAR(Value(Activation::kSoftplus, 0, z, 0), softplus, 1e-15);
+    EXPECT_NEAR(Value(Activation::kMish, 0, z, 0), z * std::tanh(softplus), 1e-15);
+    const double selu = z > 0 ? 1.0507009873554805 * z : 1.0507009873554805 * 1.6732632423543772 * (std::exp(z) - 1);
+    EXPECT_NEAR(Value(Activation::kSelu, 0, z, 0), selu, 1e-15);
+  }
+}
+
+TEST(ActivationTest, EachDerivativeIsTheSlopeOfTheOneBelow) {
+  for (const Activation activation : kAll) {
+    const double a = activation == Activation::kElu ? 0.8 : DefaultParameter(activation);
+    for (int order = 1; order <= kMaxDerivative; ++order) {
+      for (double z = -4.05; z < 4; z += 0.1) {  // never at the kink
+        const double h = 1e-5;
+        const double slope = (Value(activation, order - 1, z + h, a) - Value(activation, order - 1, z - h, a)) / (2 * h);
+        EXPECT_NEAR(Value(activation, order, z, a), slope, 1e-8)
+            << "activation " << static_cast<int>(activation) << " order " << order << " z " << z;
+      }
+    }
+  }
+}
+
+TEST(ActivationTest, ExtremeArgumentsStayFinite) {
+  for (const Activation activation : kAll) {
+    for (int order = 0; order <= kMaxDerivative; ++order) {
+      for (const double z : {-750.0, -80.0, 80.0, 750.0}) {
+        EXPECT_TRUE(std::isfinite(Value(activation, order, z, DefaultParameter(activation))))
+            << "activation " << static_cast<int>(activation) << " order " << order << " z " << z;
+        float zf = static_cast<float>(z), out;
+        ApplyActivation(activation, order, static_cast<float>(DefaultParameter(activation)), &zf, &out, 1);
+        EXPECT_TRUE(std::isfinite(out)) << "float, activation " << static_cast<int>(activation) << " order " << order;
+      }
+    }
+  }
+}
+
+}  // namespace
+}  // namespace metaekf::autodiff

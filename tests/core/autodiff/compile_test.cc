@@ -1,0 +1,90 @@
+#include <gtest/gtest.h>
+
+#include "core/autodiff/program.h"
+#include "tests/core/autodiff/derivative_check.h"
+
+namespace metaekf::autodiff {
+namespace {
+
+/// A random straight-line graph of square matrices; every value is an output, or only the last few.
+Graph RandomGraph(base::Rng* rng, int nodes, std::vector<Value>* values) {
+  Graph g;
+  const int32_t n = 3;
+  for (int i = 0; i < 3; ++i) values->push_back(g.Input(0, 9 * i, n, n));
+  const auto pick = [&] { return (*values)[rng->Index(values->size())]; };
+  for (int i = 0; i < nodes; ++i) {
+    const Value a = pick(), b = pick();
+    Value v = kNoValue;
+    switch (rng->Index(8)) {
+      case 0:
+        v = g.MatMul(a, b, rng->Index(2) != 0, rng->Index(2) != 0);
+        break;
+      case 1:
+        v = g.Add(a, g.MatMul(a, b));
+        break;
+      case 2:
+        v = g.Mul(a, b);
+        break;
+      case 3:
+        v = g.Sub(a, g.Scale(b, 0.5));
+        break;
+      case 4:
+        v = g.Add(a, g.Tile(g.SumTiles(b, 1, 3), 1, 3));
+        break;
+      case 5:
+        v = g.MatMul(g.SliceRows(a, 1, 2), g.SliceRows(b, 0, 2), true, false);
+        break;
+      case 6:
+        v = g.ConcatRows({g.SliceRows(a, 2, 1), g.SliceRows(b, 0, 2)});
+        break;
+      default:
+        v = g.Apply(Activation::kTanh, 0, 0, g.ScaleBy(g.Dot(a, b), a));
+        break;
+    }
+    values->push_back(g.Apply(Activation::kTanh, 0, 0, v));
+  }
+  return g;
+}
+
+// Oracle: the same value compiled with every other value kept, so that no buffer is reused and nothing fused away.
+TEST(CompileTest, ReusingBuffersChangesNoResult) {
+  for (uint64_t seed = 0; seed < 60; ++seed) {
+    base::Rng rng(seed);
+    std::vector<Value> values;
+    const Graph g = RandomGraph(&rng, 25, &values);
+    std::vector<double> inputs(27);
+    for (double& value : inputs) value = rng.Normal();
+    const std::vector<double> all = EvaluateFlat(g, values, {inputs});
+    const std::vector<double> last = EvaluateFlat(g, {values.back()}, {inputs});
+    for (size_t i = 0; i < 9; ++i) EXPECT_NEAR(last[i], all[all.size() - 9 + i], 1e-12) << "seed " << seed;
+  }
+}
+
+TEST(CompileTest, ScratchDoesNotGrowWithTheLengthOfAChain) {
+  const auto arena = [](int layers) {
+    Graph g;
+    Value x = g.Input(0, 0, 16, 16);
+    const Value w = g.Input(1, 0, 16, 16);
+    for (int i = 0; i < layers; ++i) x = g.Apply(Activation::kTanh, 0, 0, g.MatMul(w, x));
+    return Compile(g, {{x, 2}}).arena_size;
+  };
+  EXPECT_EQ(arena(20), arena(200));
+}
+
+TEST(CompileTest, AnOutputMayBeAnInputAConstantOrWantedTwice) {
+  Graph g;
+  const Value x = g.Input(0, 0, 2, 1), c = g.Constant(3, 2, 1), y = g.Add(x, c);
+  EXPECT_EQ(EvaluateFlat(g, {x, c, y, y}, {{1, 2}}), (std::vector<double>{1, 2, 3, 3, 4, 5, 4, 5}));
+}
+
+TEST(CompileTest, SumsAreFoldedIntoProducts) {
+  Graph g;
+  const Value w = g.Input(0, 0, 4, 4), x = g.Input(1, 0, 4, 8), b = g.Input(2, 0, 4, 1);
+  const Program program = Compile(g, {{g.AddColumn(g.MatMul(w, x), b), 3}});
+  ASSERT_EQ(program.instructions.size(), 1u);
+  EXPECT_EQ(program.instructions[0].op, Opcode::kMatMulAdd);
+  EXPECT_EQ(program.arena_size, 0);
+}
+
+}  // namespace
+}  // namespace metaekf::autodiff
