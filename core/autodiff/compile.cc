@@ -138,7 +138,6 @@ class Compiler {
       ReleaseReadBy(v);
     }
     for (const Output& output : outputs_) {
-      program_.slots = std::max(program_.slots, output.slot + 1);
       if (bound_.count(output.value) != 0 && bound_.at(output.value) == &output) continue;
       const Node& node = graph_.node(output.value);
       EmitCopy(&program_.instructions, SlotOperand(output, node.rows), place(output.value), node);
@@ -405,7 +404,6 @@ class Compiler {
     switch (node.op) {
       case Op::kInput:
         where = {.slot = node.slot, .offset = node.offset, .ld = node.rows};
-        program_.slots = std::max(program_.slots, node.slot + 1);
         return;
       case Op::kConstant:
         where = ConstantPlace(node);

@@ -14,11 +14,11 @@ constexpr std::align_val_t kAlignment{128};
 template <typename T>
 class Machine {
  public:
-  Machine(const Program& program, T* const* slots, Workspace<T>* workspace) : program_(program) {
-    bases_ = slots;
-    arena_ = workspace->arena();
-    constants_ = workspace->constants();
-  }
+  Machine(const Executable<T>& executable, T* const* slots, T* arena)
+      : program_(executable.program()),
+        bases_(slots),
+        arena_(arena),
+        constants_(const_cast<T*>(executable.constants())) {}
 
   void Run() {
     for (const Instruction& i : program_.instructions) {
@@ -185,21 +185,19 @@ class Machine {
 }  // namespace
 
 template <typename T>
-void Workspace<T>::Free::operator()(T* memory) const {
+void AlignedBuffer<T>::Free::operator()(T* memory) const {
   ::operator delete[](memory, kAlignment);
 }
 
 template <typename T>
-std::unique_ptr<T[], typename Workspace<T>::Free> Workspace<T>::Allocate(int64_t elements) {
-  const size_t bytes = sizeof(T) * static_cast<size_t>(std::max<int64_t>(elements, 1));
-  return std::unique_ptr<T[], Free>(static_cast<T*>(::operator new[](bytes, kAlignment)));
-}
+AlignedBuffer<T>::AlignedBuffer(int64_t elements)
+    : memory_(static_cast<T*>(
+          ::operator new[](sizeof(T) * static_cast<size_t>(std::max<int64_t>(elements, 1)), kAlignment))) {}
 
 template <typename T>
-Workspace<T>::Workspace(const Program& program)
-    : arena_(Allocate(program.arena_size)), constants_(Allocate(program.constants_size)) {
-  for (const Program::ConstantBlock& block : program.constants) {
-    T* target = constants_.get() + block.offset;
+Executable<T>::Executable(Program program) : program_(std::move(program)), constants_(program_.constants_size) {
+  for (const Program::ConstantBlock& block : program_.constants) {
+    T* target = constants_.data() + block.offset;
     if (block.data) {
       std::copy(block.data->begin(), block.data->end(), target);
     } else {
@@ -209,13 +207,23 @@ Workspace<T>::Workspace(const Program& program)
 }
 
 template <typename T>
-void Evaluate(const Program& program, const Slots<T>& slots, Workspace<T>* workspace) {
-  Machine<T>(program, slots.data(), workspace).Run();
+Arena<T>::Arena(std::initializer_list<const Executable<T>*> users)
+    : memory_(std::max(users, [](const Executable<T>* a, const Executable<T>* b) {
+                return a->program().arena_size < b->program().arena_size;
+              })->program().arena_size) {}
+
+template <typename T>
+void Evaluate(const Executable<T>& executable, const Slots<T>& slots, const Arena<T>& arena) {
+  Machine<T>(executable, slots.data(), arena.data()).Run();
 }
 
-template class Workspace<float>;
-template class Workspace<double>;
-template void Evaluate(const Program&, const Slots<float>&, Workspace<float>*);
-template void Evaluate(const Program&, const Slots<double>&, Workspace<double>*);
+template class AlignedBuffer<float>;
+template class AlignedBuffer<double>;
+template class Executable<float>;
+template class Executable<double>;
+template class Arena<float>;
+template class Arena<double>;
+template void Evaluate(const Executable<float>&, const Slots<float>&, const Arena<float>&);
+template void Evaluate(const Executable<double>&, const Slots<double>&, const Arena<double>&);
 
 }  // namespace metaekf::autodiff

@@ -1,54 +1,72 @@
 #pragma once
 
+#include <array>
 #include <cstddef>
+#include <initializer_list>
 #include <memory>
-#include <vector>
 
 #include "core/autodiff/program.h"
 
 namespace metaekf::autodiff {
 
-/// The scratch memory of one running program: an arena, and the program's constants.
+/// Memory aligned for the widest vector instructions.
 template <typename T>
-class Workspace {
+class AlignedBuffer {
  public:
-  explicit Workspace(const Program& program);
-
-  T* arena() { return arena_.get(); }
-  T* constants() { return constants_.get(); }
+  explicit AlignedBuffer(int64_t elements);
+  T* data() const { return memory_.get(); }
 
  private:
   struct Free {
     void operator()(T* memory) const;
   };
-  static std::unique_ptr<T[], Free> Allocate(int64_t elements);
+  std::unique_ptr<T[], Free> memory_;
+};
 
-  std::unique_ptr<T[], Free> arena_;  // aligned to 128 bytes
-  std::unique_ptr<T[], Free> constants_;
+/// A program with its constants in place: what runs. Never changes, so threads may share it.
+template <typename T>
+class Executable {
+ public:
+  explicit Executable(Program program);
+
+  const Program& program() const { return program_; }
+  const T* constants() const { return constants_.data(); }
+
+ private:
+  Program program_;
+  AlignedBuffer<T> constants_;
+};
+
+/// Scratch memory for any of a few executables, one at a time.
+template <typename T>
+class Arena {
+ public:
+  explicit Arena(std::initializer_list<const Executable<T>*> users);
+  T* data() const { return memory_.data(); }
+
+ private:
+  AlignedBuffer<T> memory_;
 };
 
 /// Which memory each slot is. Inputs are only read.
 template <typename T>
 class Slots {
  public:
-  explicit Slots(const Program& program) : pointers_(static_cast<size_t>(program.slots), nullptr) {}
+  static constexpr size_t kMaxSlots = 16;
 
-  Slots& Input(int32_t slot, const T* memory) { return Set(slot, const_cast<T*>(memory)); }
-  Slots& Output(int32_t slot, T* memory) { return Set(slot, memory); }
+  Slots& Input(int32_t slot, const T* memory) { return Output(slot, const_cast<T*>(memory)); }
+  Slots& Output(int32_t slot, T* memory) {
+    pointers_[static_cast<size_t>(slot)] = memory;
+    return *this;
+  }
   T* const* data() const { return pointers_.data(); }
 
  private:
-  /// A slot that the program turned out not to need is ignored.
-  Slots& Set(int32_t slot, T* memory) {
-    if (static_cast<size_t>(slot) < pointers_.size()) pointers_[static_cast<size_t>(slot)] = memory;
-    return *this;
-  }
-  std::vector<T*> pointers_;
+  std::array<T*, kMaxSlots> pointers_{};
 };
 
-/// Runs a program on the CPU, in the calling thread: no allocation. Programs may be shared between threads,
-/// workspaces may not.
+/// Runs a program on the CPU, in the calling thread, without allocating.
 template <typename T>
-void Evaluate(const Program& program, const Slots<T>& slots, Workspace<T>* workspace);
+void Evaluate(const Executable<T>& executable, const Slots<T>& slots, const Arena<T>& arena);
 
 }  // namespace metaekf::autodiff

@@ -64,7 +64,6 @@ struct Program {
   std::vector<Instruction> instructions;
   std::vector<Loop> loops;
   int64_t arena_size = 0;  ///< elements of scratch that a run needs
-  int32_t slots = 0;       ///< one more than the highest slot in use
 
   struct ConstantBlock {
     int64_t offset;

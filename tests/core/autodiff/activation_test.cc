@@ -18,9 +18,8 @@ double Value(Activation activation, int order, double z, double a) {
   return out;
 }
 
-// Values of PyTorch 1.13's modules in double at z = 0.7 and −1.3 (relu, leaky_relu(0.01), elu(1), selu, tanh, silu,
-// mish, softplus).
-TEST(ActivationTest, ValuesMatchPyTorch) {
+// By hand: max(z, 0), 0.01 z, eᶻ − 1 and tanh z at z = 0.7 and −1.3.
+TEST(ActivationTest, ValuesMatchHandComputedOnes) {
   const struct {
     Activation activation;
     double positive, negative;

@@ -22,16 +22,16 @@ inline std::vector<double> EvaluateFlat(const Graph& graph, const std::vector<Va
     bound.push_back({output, slot, size});
     size += int64_t{graph.node(output).rows} * graph.node(output).cols;
   }
-  const Program program = Compile(graph, bound);
-  Workspace<double> workspace(program);
-  Slots<double> slots(program);
+  const Executable<double> executable(Compile(graph, bound));
+  const Arena<double> arena({&executable});
+  Slots<double> slots;
   for (size_t i = 0; i < inputs.size(); ++i) slots.Input(static_cast<int32_t>(i), inputs[i].data());
   std::vector<double> result(static_cast<size_t>(size), std::nan(""));
   slots.Output(slot, result.data());
-  Evaluate(program, slots, &workspace);
+  Evaluate(executable, slots, arena);
   // A second run must not depend on what the first left behind.
   const std::vector<double> first = result;
-  Evaluate(program, slots, &workspace);
+  Evaluate(executable, slots, arena);
   EXPECT_EQ(first, result);
   return result;
 }

@@ -1,0 +1,81 @@
+#include "core/meta/training_spec.h"
+
+#include "core/base/status.h"
+
+namespace metaekf::meta {
+namespace {
+
+using base::JsonFields;
+using nlohmann::json;
+
+const std::vector<std::pair<std::string, Algorithm>> kAlgorithms = {
+    {"MAML", Algorithm::kMaml}, {"FIRST_ORDER_MAML", Algorithm::kFirstOrderMaml}, {"SUPERVISED", Algorithm::kSupervised}};
+
+constexpr int32_t kMany = 100'000'000;
+
+InnerLoopSpec ReadInnerLoop(JsonFields* parent, const std::string& name, InnerLoopSpec spec) {
+  JsonFields fields = parent->Object(name);
+  spec.steps = static_cast<int32_t>(fields.Integer("steps", spec.steps, 0, 1'000'000));
+  spec.learning_rate = fields.Number("learning_rate", spec.learning_rate, 0, 1e6);
+  spec.adapted_mask = fields.String("adapted_mask", spec.adapted_mask);
+  parent->Include(fields.Finish());
+  return spec;
+}
+
+json InnerLoopJson(const InnerLoopSpec& spec) {
+  return {{"steps", spec.steps}, {"learning_rate", spec.learning_rate}, {"adapted_mask", spec.adapted_mask}};
+}
+
+}  // namespace
+
+absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
+  JsonFields fields(object, "");
+  TrainingSpec spec;
+  METAEKF_ASSIGN_OR_RETURN(spec.model, nssm::ReadModelSpec(fields.Object("model")));
+  METAEKF_ASSIGN_OR_RETURN(spec.loss, nssm::ReadLossSpec(fields.Object("loss"), spec.model));
+  spec.algorithm = fields.Choice("algorithm", Algorithm::kMaml, kAlgorithms);
+  spec.inner_loop = ReadInnerLoop(&fields, "inner_loop", InnerLoopSpec());
+  spec.adaptation = ReadInnerLoop(&fields, "adaptation", spec.inner_loop);
+  const auto positive = [&fields](const std::string& name, int32_t default_value) {
+    const int32_t value = static_cast<int32_t>(fields.Integer(name, default_value, 0, kMany));
+    return value == 0 ? default_value : value;
+  };
+  spec.context_samples = positive("context_samples", spec.context_samples);
+  spec.target_samples = positive("target_samples", spec.target_samples);
+  spec.task_batch = positive("task_batch", spec.task_batch);
+  spec.iterations = positive("iterations", spec.iterations);
+  spec.outer_lr = fields.Number("outer_lr", spec.outer_lr, 0, 1e3);
+  spec.final_outer_lr = fields.Number("final_outer_lr", spec.outer_lr, 0, 1e3);
+  spec.clip_norm = fields.Number("clip_norm", spec.clip_norm, 0, 1e12);
+  spec.validation_share = fields.Number("validation_share", spec.validation_share, 0, 0.9);
+  spec.validation_period = positive("validation_period", spec.validation_period);
+  spec.seed = static_cast<uint64_t>(fields.Integer("seed", 0, 0, INT64_MAX));
+  spec.sample_period_s = fields.Number("sample_period_s", 0, 0, 1e9);
+  METAEKF_RETURN_IF_ERROR(fields.Finish());
+  return spec;
+}
+
+json ToJson(const TrainingSpec& spec) {
+  std::string algorithm;
+  for (const auto& [name, value] : kAlgorithms) {
+    if (value == spec.algorithm) algorithm = name;
+  }
+  return {{"model", nssm::ToJson(spec.model)},
+          {"loss", nssm::ToJson(spec.loss)},
+          {"algorithm", algorithm},
+          {"inner_loop", InnerLoopJson(spec.inner_loop)},
+          {"adaptation", InnerLoopJson(spec.adaptation)},
+          {"context_samples", spec.context_samples},
+          {"target_samples", spec.target_samples},
+          {"task_batch", spec.task_batch},
+          {"iterations", spec.iterations},
+          {"outer_lr", spec.outer_lr},
+          {"final_outer_lr", spec.final_outer_lr},
+          {"clip_norm", spec.clip_norm},
+          {"validation_share", spec.validation_share},
+          {"validation_period", spec.validation_period},
+          {"seed", spec.seed},
+          {"sample_period_s", spec.sample_period_s}};
+}
+
+}  // namespace metaekf::meta

@@ -1,0 +1,46 @@
+#pragma once
+
+#include <nlohmann/json.hpp>
+#include <string>
+
+#include "absl/status/statusor.h"
+#include "core/nssm/spec.h"
+
+namespace metaekf::meta {
+
+enum class Algorithm { kMaml, kFirstOrderMaml, kSupervised };
+
+/// The inner loop, in training or at adaptation: the message InnerLoopSpec of spec.proto.
+struct InnerLoopSpec {
+  int32_t steps = 10;
+  double learning_rate = 0.01;
+  std::string adapted_mask = "*";
+};
+
+/// How a model is meta-trained: the message TrainingSpec of spec.proto, where each field is described.
+struct TrainingSpec {
+  nssm::ModelSpec model;
+  nssm::LossSpec loss;
+  Algorithm algorithm = Algorithm::kMaml;
+  InnerLoopSpec inner_loop;
+  InnerLoopSpec adaptation;
+  int32_t context_samples = 100;
+  int32_t target_samples = 100;
+  int32_t task_batch = 8;
+  int32_t iterations = 1000;
+  double outer_lr = 1e-3;
+  double final_outer_lr = 1e-3;
+  double clip_norm = 10;
+  double validation_share = 0.2;
+  int32_t validation_period = 25;
+  uint64_t seed = 0;
+  double sample_period_s = 0;  ///< 0: the data's
+};
+
+/// Reads the JSON form of the message. Errors: InvalidArgument naming the field and what is wrong with it.
+absl::StatusOr<TrainingSpec> ReadTrainingSpec(const nlohmann::json& object);
+
+/// The inverse: every field spelled out.
+nlohmann::json ToJson(const TrainingSpec& spec);
+
+}  // namespace metaekf::meta

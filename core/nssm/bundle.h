@@ -1,0 +1,47 @@
+#pragma once
+
+#include <nlohmann/json.hpp>
+#include <string>
+#include <vector>
+
+#include "absl/status/statusor.h"
+#include "core/data/normaliser.h"
+#include "core/nssm/model.h"
+
+namespace metaekf::nssm {
+
+/// Covariances that a filter starts from, of the filter's own coordinates: physical units in Case II, latents in
+/// Case I (R and outputs are physical in both).
+struct FilterNoise {
+  Eigen::MatrixXd process;      ///< Q, n × n
+  Eigen::MatrixXd measurement;  ///< R, n_y × n_y
+  Eigen::MatrixXd initial;      ///< covariance of the first state, n × n
+};
+
+struct ChannelNames {
+  std::vector<std::string> inputs, outputs, states;
+};
+
+/// Everything that a model file holds: what is needed to use a model, and nothing else.
+struct Bundle {
+  Model model;
+  std::vector<double> parameters;  ///< ω; values are float-exact where the spec says FLOAT32
+  data::Normaliser normaliser;
+  double sample_period_s = 0;
+  ChannelNames names;
+  FilterNoise noise;
+  /// Specification of the training, as JSON: `adapt` takes its defaults from it.
+  nlohmann::json training;
+  /// Where the model comes from: seed, data digest, losses.
+  nlohmann::json provenance;
+};
+
+/// Checks that a trajectory has the channels the model needs, and as many.
+/// @param need_states  whether the whole of x is read (Case II).
+/// Errors: InvalidArgument naming the channels that are missing.
+absl::Status CheckChannels(const Bundle& bundle, const data::Trajectory& trajectory, bool need_states);
+
+/// Rounds to the precision of the spec.
+void RoundToPrecision(Precision precision, std::vector<double>* values);
+
+}  // namespace metaekf::nssm

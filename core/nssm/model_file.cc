@@ -1,0 +1,190 @@
+#include "core/nssm/model_file.h"
+
+#include <algorithm>
+
+#include "core/base/status.h"
+#include "core/nssm/safetensors.h"
+
+namespace metaekf::nssm {
+namespace {
+
+using base::JsonFields;
+using nlohmann::json;
+
+constexpr char kMetadataKey[] = "metaekf";
+
+json ListOf(const Eigen::VectorXd& vector) { return std::vector<double>(vector.begin(), vector.end()); }
+
+/// Row by row.
+json ListOf(const Eigen::MatrixXd& matrix) {
+  json rows = json::array();
+  for (Eigen::Index i = 0; i < matrix.rows(); ++i) rows.push_back(ListOf(Eigen::VectorXd(matrix.row(i))));
+  return rows;
+}
+
+json ScalingJson(const data::ChannelScaling& scaling) {
+  return {{"mean", ListOf(scaling.mean)}, {"scale", ListOf(scaling.scale)}};
+}
+
+data::ChannelScaling ReadScaling(JsonFields* parent, const std::string& name, int32_t channels) {
+  JsonFields fields = parent->Object(name);
+  const auto vector = [&](const std::string& field) {
+    const std::vector<double> values = fields.Numbers(field);
+    if (static_cast<int32_t>(values.size()) != channels) {
+      fields.Fail(field, absl::StrCat("expected ", channels, " numbers, got ", values.size()));
+    }
+    return Eigen::VectorXd(Eigen::Map<const Eigen::VectorXd>(values.data(), static_cast<Eigen::Index>(values.size())));
+  };
+  data::ChannelScaling scaling{vector("mean"), vector("scale")};
+  if ((scaling.scale.array() <= 0).any()) fields.Fail("scale", "must be positive");
+  parent->Include(fields.Finish());
+  return scaling;
+}
+
+/// A symmetric matrix, n × n, row by row.
+Eigen::MatrixXd ReadCovariance(JsonFields* parent, const json& object, const std::string& name, int32_t n) {
+  Eigen::MatrixXd matrix = Eigen::MatrixXd::Zero(n, n);
+  const auto it = object.find(name);
+  bool valid = it != object.end() && it->is_array() && static_cast<int32_t>(it->size()) == n;
+  for (int32_t i = 0; valid && i < n; ++i) {
+    const json& row = (*it)[static_cast<size_t>(i)];
+    valid = row.is_array() && static_cast<int32_t>(row.size()) == n;
+    for (int32_t j = 0; valid && j < n; ++j) {
+      valid = row[static_cast<size_t>(j)].is_number();
+      if (valid) matrix(i, j) = row[static_cast<size_t>(j)].get<double>();
+    }
+  }
+  if (!valid || !matrix.allFinite() || !matrix.isApprox(matrix.transpose(), 1e-9) ||
+      (matrix.diagonal().array() < 0).any()) {
+    parent->Fail(name, absl::StrCat("expected a symmetric matrix of ", n, " × ", n, " numbers"));
+  }
+  return matrix;
+}
+
+std::vector<std::string> ReadNames(JsonFields* fields, const json& object, const std::string& name, int32_t count) {
+  std::vector<std::string> names;
+  const auto it = object.find(name);
+  if (it != object.end() && it->is_array()) {
+    for (const json& item : *it) names.push_back(item.is_string() ? item.get<std::string>() : "");
+  }
+  if (static_cast<int32_t>(names.size()) != count) fields->Fail(name, absl::StrCat("expected ", count, " names"));
+  return names;
+}
+
+Safetensors::Tensor TensorOf(const nn::Tensor& tensor, const Bundle& bundle) {
+  const auto begin = bundle.parameters.begin() + tensor.offset;
+  return {.name = tensor.name,
+          .shape = tensor.is_bias ? std::vector<int64_t>{tensor.out} : std::vector<int64_t>{tensor.out, tensor.in},
+          .is_float32 = bundle.model.spec().precision == Precision::kFloat32,
+          .values = std::vector<double>(begin, begin + tensor.size())};
+}
+
+absl::Status StoreTensor(const Safetensors::Tensor& tensor, Bundle* bundle, nn::Mask* seen) {
+  const std::vector<nn::Tensor>& tensors = bundle->model.layout().tensors();
+  for (size_t i = 0; i < tensors.size(); ++i) {
+    if (tensors[i].name != tensor.name) continue;
+    const Safetensors::Tensor expected = TensorOf(tensors[i], *bundle);
+    if (tensor.shape != expected.shape || tensor.is_float32 != expected.is_float32) {
+      return absl::InvalidArgumentError(
+          absl::StrCat("tensor \"", tensor.name, "\" has not the shape or type that the specification says"));
+    }
+    std::copy(tensor.values.begin(), tensor.values.end(), bundle->parameters.begin() + tensors[i].offset);
+    (*seen)[i] = true;
+    return absl::OkStatus();
+  }
+  return absl::InvalidArgumentError(absl::StrCat("tensor \"", tensor.name, "\" is not part of the model"));
+}
+
+}  // namespace
+
+std::string WriteModelFile(const Bundle& bundle) {
+  Safetensors file;
+  for (const nn::Tensor& tensor : bundle.model.layout().tensors()) file.tensors.push_back(TensorOf(tensor, bundle));
+  const json description = {
+      {"format_version", kModelFormatVersion},
+      {"model", ToJson(bundle.model.spec())},
+      {"sample_period_s", bundle.sample_period_s},
+      {"input_names", bundle.names.inputs},
+      {"output_names", bundle.names.outputs},
+      {"state_names", bundle.names.states},
+      {"normalisation",
+       {{"inputs", ScalingJson(bundle.normaliser.inputs)},
+        {"outputs", ScalingJson(bundle.normaliser.outputs)},
+        {"states", ScalingJson(bundle.normaliser.states)}}},
+      {"noise",
+       {{"process_cov", ListOf(bundle.noise.process)},
+        {"measurement_cov", ListOf(bundle.noise.measurement)},
+        {"initial_cov", ListOf(bundle.noise.initial)}}},
+      {"training", bundle.training},
+      {"provenance", bundle.provenance},
+  };
+  file.metadata[kMetadataKey] = description.dump();
+  return WriteSafetensors(file);
+}
+
+absl::StatusOr<Bundle> ReadModelFile(const std::string& bytes) {
+  METAEKF_ASSIGN_OR_RETURN(const Safetensors file, ReadSafetensors(bytes));
+  const auto metadata = file.metadata.find(kMetadataKey);
+  if (metadata == file.metadata.end()) {
+    return absl::InvalidArgumentError("the file has no \"metaekf\" metadata: it was not written by metaekf");
+  }
+  json object;
+  METAEKF_RETURN_IF_ERROR(base::Annotate(base::ParseJson(metadata->second, &object), "metadata \"metaekf\""));
+  JsonFields fields(object, "metadata");
+  const int64_t version = fields.Integer("format_version", 0, 0, 1 << 30);
+  if (version != kModelFormatVersion) {
+    return absl::InvalidArgumentError(absl::StrCat("the file has format version ", version, ", this program reads version ",
+                                                   kModelFormatVersion));
+  }
+  METAEKF_ASSIGN_OR_RETURN(const ModelSpec spec, ReadModelSpec(fields.Object("model")));
+  METAEKF_ASSIGN_OR_RETURN(Model model, Model::Create(spec));
+  Bundle bundle{.model = std::move(model)};
+  bundle.sample_period_s = fields.Number("sample_period_s", 0, 1e-12, 1e12);
+  bundle.names.inputs = ReadNames(&fields, object, "input_names", spec.input_size);
+  bundle.names.outputs = ReadNames(&fields, object, "output_names", spec.output_size);
+  bundle.names.states = ReadNames(&fields, object, "state_names", spec.state_size);
+  JsonFields normalisation = fields.Object("normalisation");
+  bundle.normaliser.inputs = ReadScaling(&normalisation, "inputs", spec.input_size);
+  bundle.normaliser.outputs = ReadScaling(&normalisation, "outputs", spec.output_size);
+  bundle.normaliser.states = ReadScaling(&normalisation, "states", spec.state_size);
+  METAEKF_RETURN_IF_ERROR(normalisation.Finish());
+  if (!object.contains("noise") || !object["noise"].is_object()) {
+    return absl::InvalidArgumentError("metadata.noise is missing");
+  }
+  const json& noise = object["noise"];
+  const int32_t filter_size = spec.is_case_one() ? spec.latent_size : spec.state_size;
+  JsonFields noise_fields(noise, "metadata.noise");
+  bundle.noise.process = ReadCovariance(&noise_fields, noise, "process_cov", filter_size);
+  bundle.noise.measurement = ReadCovariance(&noise_fields, noise, "measurement_cov", spec.output_size);
+  bundle.noise.initial = ReadCovariance(&noise_fields, noise, "initial_cov", filter_size);
+  METAEKF_RETURN_IF_ERROR(noise_fields.status());
+  METAEKF_RETURN_IF_ERROR(fields.status());
+  bundle.training = object.value("training", json::object());
+  bundle.provenance = object.value("provenance", json::object());
+  bundle.parameters.assign(static_cast<size_t>(bundle.model.layout().size()), 0.0);
+  nn::Mask seen(bundle.model.layout().tensors().size(), false);
+  for (const Safetensors::Tensor& tensor : file.tensors) METAEKF_RETURN_IF_ERROR(StoreTensor(tensor, &bundle, &seen));
+  for (size_t i = 0; i < seen.size(); ++i) {
+    if (!seen[i]) {
+      return absl::InvalidArgumentError(absl::StrCat("tensor \"", bundle.model.layout().tensors()[i].name, "\" is missing"));
+    }
+  }
+  return bundle;
+}
+
+std::string WriteAdaptedSubset(const Bundle& bundle, const nn::Mask& mask) {
+  Safetensors file;
+  for (size_t i = 0; i < mask.size(); ++i) {
+    if (mask[i]) file.tensors.push_back(TensorOf(bundle.model.layout().tensors()[i], bundle));
+  }
+  return WriteSafetensors(file);
+}
+
+absl::Status ApplyAdaptedSubset(const std::string& bytes, Bundle* bundle) {
+  METAEKF_ASSIGN_OR_RETURN(const Safetensors file, ReadSafetensors(bytes));
+  nn::Mask seen(bundle->model.layout().tensors().size(), false);
+  for (const Safetensors::Tensor& tensor : file.tensors) METAEKF_RETURN_IF_ERROR(StoreTensor(tensor, bundle, &seen));
+  return absl::OkStatus();
+}
+
+}  // namespace metaekf::nssm

@@ -1,0 +1,154 @@
+#include "core/nssm/loss.h"
+
+#include <gtest/gtest.h>
+
+#include "tests/core/nssm/random_models.h"
+
+namespace metaekf::nssm {
+namespace {
+
+struct Problem {
+  Model model;
+  LossShape shape;
+  LossData<double> data;
+  std::vector<double> parameters;
+};
+
+Problem MakeProblem(const ModelCase& c, int64_t samples = 9) {
+  Model model = *Model::Create(c.model);
+  const LossShape shape = *ShapeOfLoss(c.model, c.loss, samples);
+  LossData<double> data = CutLossData<double>(c.model, c.loss, RandomTrajectory(c.model, samples + 2, 3), 1, shape);
+  std::vector<double> parameters = RandomParameters(model, 7);
+  return {std::move(model), shape, std::move(data), std::move(parameters)};
+}
+
+nn::Mask All(const Model& model) { return nn::Mask(model.layout().tensors().size(), true); }
+
+double Norm(const std::vector<double>& v) {
+  double sum = 0;
+  for (const double value : v) sum += value * value;
+  return std::sqrt(sum);
+}
+
+TEST(LossTest, GradientsMatchCentralDifferencesForEveryKindOfModel) {
+  for (const ModelCase& c : ModelCases()) {
+    SCOPED_TRACE(c.name);
+    const Problem p = MakeProblem(c);
+    const LossFunction<double> loss(p.model, c.loss, p.shape, All(p.model), All(p.model));
+    const auto scratch = loss.MakeScratch();
+    std::vector<double> gradient(p.parameters.size());
+    const double value = loss.Gradient(p.parameters.data(), p.data, gradient.data(), scratch);
+    EXPECT_DOUBLE_EQ(value, loss.Value(p.parameters.data(), p.data, scratch));
+    const double h = 1e-5;
+    for (size_t i = 0; i < gradient.size(); ++i) {
+      std::vector<double> moved = p.parameters;
+      moved[i] += h;
+      const double up = loss.Value(moved.data(), p.data, scratch);
+      moved[i] -= 2 * h;
+      const double down = loss.Value(moved.data(), p.data, scratch);
+      EXPECT_NEAR(gradient[i], (up - down) / (2 * h), 1e-7 * (1 + Norm(gradient))) << "parameter " << i;
+    }
+  }
+}
+
+TEST(LossTest, HessianVectorProductsMatchCentralDifferencesOfTheGradient) {
+  for (const ModelCase& c : ModelCases()) {
+    SCOPED_TRACE(c.name);
+    const Problem p = MakeProblem(c);
+    const LossFunction<double> loss(p.model, c.loss, p.shape, All(p.model), All(p.model));
+    const auto scratch = loss.MakeScratch();
+    const size_t n = p.parameters.size();
+    base::Rng rng(1);
+    std::vector<double> v(n), product(n), up(n), down(n), moved(n);
+    for (double& value : v) value = rng.Normal();
+    loss.HessianVector(p.parameters.data(), p.data, v.data(), product.data(), scratch);
+    const double h = 1e-5;
+    for (size_t i = 0; i < n; ++i) moved[i] = p.parameters[i] + h * v[i];
+    loss.Gradient(moved.data(), p.data, up.data(), scratch);
+    for (size_t i = 0; i < n; ++i) moved[i] = p.parameters[i] - h * v[i];
+    loss.Gradient(moved.data(), p.data, down.data(), scratch);
+    for (size_t i = 0; i < n; ++i) {
+      EXPECT_NEAR(product[i], (up[i] - down[i]) / (2 * h), 1e-7 * (1 + Norm(product))) << "parameter " << i;
+    }
+  }
+}
+
+TEST(LossTest, AMaskedGradientIsTheFullOneRestricted) {
+  const ModelCase c = ModelCases().front();
+  const Problem p = MakeProblem(c);
+  const nn::Mask mask = *nn::ParseMask("encoder.1,output_decoder", p.model.layout());
+  const LossFunction<double> full(p.model, c.loss, p.shape, All(p.model), All(p.model));
+  const LossFunction<double> masked(p.model, c.loss, p.shape, mask, mask);
+  std::vector<double> a(p.parameters.size()), b(p.parameters.size(), 1);
+  full.Gradient(p.parameters.data(), p.data, a.data(), full.MakeScratch());
+  masked.Gradient(p.parameters.data(), p.data, b.data(), masked.MakeScratch());
+  for (size_t i = 0; i < mask.size(); ++i) {
+    const nn::Tensor& tensor = p.model.layout().tensors()[i];
+    for (int64_t k = tensor.offset; k < tensor.offset + tensor.size(); ++k) {
+      EXPECT_DOUBLE_EQ(b[static_cast<size_t>(k)], mask[i] ? a[static_cast<size_t>(k)] : 0) << tensor.name;
+    }
+  }
+}
+
+// Oracle: the loss written out with loops and Eigen for a linear Case II model, straight from its definition.
+TEST(LossTest, ALinearCaseTwoLossEqualsItsDefinition) {
+  ModelSpec spec{.kind = Case::kStateInputOutput, .input_size = 1, .output_size = 1, .state_size = 2, .latent_size = 3, .window = 1};
+  spec.precision = Precision::kFloat64;
+  const LossSpec loss{.horizon = 2, .rollout = RolloutMode::kState, .stride = 3, .output_weight = 2, .state_weight = 3, .reconstruction_weight = 5};
+  const Problem p = MakeProblem({"linear", spec, loss}, 12);
+  const data::Trajectory d = RandomTrajectory(spec, 14, 3);
+  const auto affine = [&p](const std::string& block, const Eigen::VectorXd& x) {
+    Eigen::VectorXd y;
+    for (const nn::Tensor& t : p.model.layout().tensors()) {
+      const double* values = p.parameters.data() + t.offset;
+      if (t.name == block + ".0.weight") {
+        y = Eigen::Map<const Eigen::Matrix<double, -1, -1, Eigen::RowMajor>>(values, t.out, t.in) * x;
+      }
+      if (t.name == block + ".0.bias") y += Eigen::Map<const Eigen::VectorXd>(values, t.out);
+    }
+    return y;
+  };
+  const auto stack = [](const Eigen::VectorXd& a, double b) {
+    Eigen::VectorXd s(a.size() + 1);
+    s << a, b;
+    return s;
+  };
+  double recon = 0, state = 0, output = 0;
+  int rollouts = 0;
+  for (int t = 1; t + 2 <= 12; t += 3, ++rollouts) {  // samples 1 … 12 of the trajectory
+    Eigen::VectorXd x = d.states.col(t);
+    for (int k = 0; k < 2; ++k) {
+      const Eigen::VectorXd latent = affine("encoder", stack(x, d.inputs(0, t + k)));
+      if (k == 0) recon += (affine("state_decoder", latent) - x).squaredNorm();
+      output += (affine("output_decoder", latent) - d.outputs.col(t + k)).squaredNorm();
+      x = affine("state_decoder", affine("transition", stack(latent, d.inputs(0, t + k))));
+      state += (x - d.states.col(t + k + 1)).squaredNorm();
+    }
+  }
+  ASSERT_EQ(rollouts, p.shape.rollouts);
+  const double expected = 5 * recon / (2 * rollouts) + 3 * state / (4 * rollouts) + 2 * output / (2 * rollouts);
+  const LossFunction<double> function(p.model, loss, p.shape, All(p.model), All(p.model));
+  EXPECT_NEAR(function.Value(p.parameters.data(), p.data, function.MakeScratch()), expected, 1e-12 * expected);
+}
+
+TEST(LossTest, TooFewSamplesAreRefusedWithTheNumberNeeded) {
+  ModelSpec spec{.kind = Case::kInputOutput, .input_size = 1, .output_size = 1, .state_size = 0, .latent_size = 2, .window = 20};
+  const absl::StatusOr<LossShape> shape = ShapeOfLoss(spec, {.horizon = 5}, 24);
+  EXPECT_EQ(shape.status().code(), absl::StatusCode::kFailedPrecondition);
+  EXPECT_NE(std::string(shape.status().message()).find("at least 25 needed"), std::string::npos) << shape.status();
+  EXPECT_EQ(ShapeOfLoss(spec, {.horizon = 5}, 25)->rollouts, 1);
+}
+
+TEST(LossTest, FloatAgreesWithDouble) {
+  const ModelCase c = ModelCases().back();
+  const Problem p = MakeProblem(c);
+  const LossFunction<double> wide(p.model, c.loss, p.shape, All(p.model), All(p.model));
+  const LossFunction<float> narrow(p.model, c.loss, p.shape, All(p.model), All(p.model));
+  const std::vector<float> parameters(p.parameters.begin(), p.parameters.end());
+  const LossData<float> data = CutLossData<float>(c.model, c.loss, RandomTrajectory(c.model, 11, 3), 1, p.shape);
+  EXPECT_NEAR(narrow.Value(parameters.data(), data, narrow.MakeScratch()),
+              wide.Value(p.parameters.data(), p.data, wide.MakeScratch()), 1e-5);
+}
+
+}  // namespace
+}  // namespace metaekf::nssm
