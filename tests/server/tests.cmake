@@ -1,2 +1,5 @@
 metaekf_test(server/status/grpc_status_test.cc DEPS metaekf::server_status metaekf::proto_messages)
 metaekf_test(server/status/text_test.cc DEPS metaekf::server_status)
+foreach(test adaptations blob_store crash database jobs models names page sessions sha256 store)
+  metaekf_test(server/store/${test}_test.cc DEPS metaekf::server_store)
+endforeach()

@@ -1,0 +1,153 @@
+#include "server/store/store.h"
+
+#include <fcntl.h>
+#include <sys/file.h>
+#include <sys/statvfs.h>
+#include <unistd.h>
+
+#include <cerrno>
+#include <filesystem>
+#include <set>
+#include <utility>
+
+#include "core/base/status.h"
+#include "server/store/schema.h"
+
+namespace metaekf::store {
+namespace {
+
+// One tenant, until clients are told apart.
+constexpr const char* kTenant = "default";
+
+std::string DatabasePath(const std::string& directory) { return directory + "/metaekf.db"; }
+std::string JobsDirectory(const std::string& directory) { return directory + "/jobs"; }
+
+/// Locks the directory for this process; the lock goes with the descriptor.
+absl::StatusOr<UniqueFd> Lock(const std::string& directory) {
+  UniqueFd file(open((directory + "/lock").c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0600));
+  if (!file.valid()) {
+    return ErrnoStatus(errno, absl::StrCat("cannot write to the data directory ", directory));
+  }
+  if (flock(file.get(), LOCK_EX | LOCK_NB) != 0) {
+    return absl::FailedPreconditionError(
+        absl::StrCat("the data directory ", directory,
+                     " is in use by another server; stop that one or use another directory"));
+  }
+  return file;
+}
+
+/// A new database beside old files would have them removed as garbage.
+absl::Status CheckDatabaseNotLost(const std::string& directory, const BlobStore& blobs) {
+  if (access(DatabasePath(directory).c_str(), F_OK) == 0) return absl::OkStatus();
+  METAEKF_ASSIGN_OR_RETURN(const auto files, blobs.List());
+  if (files.empty()) return absl::OkStatus();
+  return absl::DataLossError(absl::StrCat(
+      directory, " has ", files.size(), " stored files but no metaekf.db; restore that file from a ",
+      "backup, or remove the directory to start anew"));
+}
+
+absl::Status CountRows(Connection& connection, Inventory& inventory) {
+  return connection.Execute(
+      "SELECT count(DISTINCT tenant || '/' || model), count(*), "
+      "(SELECT count(*) FROM adaptations), "
+      "(SELECT count(*) FROM jobs WHERE state = 'QUEUED'), "
+      "(SELECT count(*) FROM jobs WHERE state = 'RUNNING'), (SELECT count(*) FROM jobs), "
+      "(SELECT count(*) FROM sessions), "
+      "total(size_bytes) + (SELECT total(size_bytes) FROM adaptations) FROM versions",
+      {}, [&](const Row& row) {
+        inventory.models = row.Int(0);
+        inventory.versions = row.Int(1);
+        inventory.adaptations = row.Int(2);
+        inventory.queued_jobs = row.Int(3);
+        inventory.running_jobs = row.Int(4);
+        inventory.ended_jobs = row.Int(5) - row.Int(3) - row.Int(4);
+        inventory.sessions = row.Int(6);
+        inventory.stored_bytes = row.Int(7);
+      });
+}
+
+using OwnedFiles = std::vector<std::pair<std::string, std::string>>;  // owner, digest
+
+absl::StatusOr<OwnedFiles> ListFiles(Connection& connection) {
+  OwnedFiles files;
+  METAEKF_RETURN_IF_ERROR(connection.Execute(
+      "SELECT 'model ''' || model || ''' version ' || version, digest FROM versions "
+      "UNION ALL SELECT 'adaptation ''' || id || '''', digest FROM adaptations "
+      "UNION ALL SELECT 'the data of job ' || number, dataset_digest FROM jobs "
+      "WHERE state IN ('QUEUED', 'RUNNING')",
+      {}, [&](const Row& row) { files.emplace_back(row.Text(0), row.Text(1)); }));
+  return files;
+}
+
+}  // namespace
+
+absl::StatusOr<std::unique_ptr<Store>> Store::Open(const std::string& directory, Clock clock) {
+  METAEKF_RETURN_IF_ERROR(MakeDirectory(directory));
+  METAEKF_ASSIGN_OR_RETURN(UniqueFd lock, Lock(directory));
+  METAEKF_ASSIGN_OR_RETURN(BlobStore blobs, BlobStore::Open(directory));
+  METAEKF_RETURN_IF_ERROR(CheckDatabaseNotLost(directory, blobs));
+  METAEKF_RETURN_IF_ERROR(MakeDirectory(JobsDirectory(directory)));
+  auto database = Database::Open(DatabasePath(directory));
+  if (!database.ok()) return base::Annotate(database.status(), directory);
+  METAEKF_RETURN_IF_ERROR(base::Annotate(PrepareSchema(**database), directory));
+  std::unique_ptr<Store> store(new Store(directory, std::move(lock), std::move(blobs),
+                                         *std::move(database), std::move(clock)));
+  METAEKF_RETURN_IF_ERROR(store->CollectGarbage());
+  return store;
+}
+
+Store::Store(const std::string& directory, UniqueFd lock, BlobStore blobs,
+             std::unique_ptr<Database> database, Clock clock)
+    : directory_(directory),
+      lock_(std::move(lock)),
+      blobs_(std::move(blobs)),
+      database_(std::move(database)),
+      context_{*database_, blobs_, std::move(clock), JobsDirectory(directory), kTenant},
+      models_(context_),
+      adaptations_(context_),
+      jobs_(context_),
+      sessions_(context_) {}
+
+absl::Status Store::CollectGarbage() {
+  return database_->Write([&](Connection& connection) -> absl::Status {
+    METAEKF_ASSIGN_OR_RETURN(const auto referenced, ReferencedBlobs(connection));
+    const std::set<std::string> keep(referenced.begin(), referenced.end());
+    METAEKF_ASSIGN_OR_RETURN(const auto files, blobs_.List());
+    for (const std::string& digest : files) {
+      if (!keep.contains(digest)) blobs_.Remove(digest);
+    }
+
+    std::set<std::string> active_jobs;
+    METAEKF_RETURN_IF_ERROR(
+        connection.Execute("SELECT number FROM jobs WHERE state IN ('QUEUED', 'RUNNING')", {},
+                           [&](const Row& row) { active_jobs.insert(row.Text(0)); }));
+    METAEKF_ASSIGN_OR_RETURN(const auto directories, ListDirectory(context_.jobs_directory));
+    for (const std::string& number : directories) {
+      if (active_jobs.contains(number)) continue;
+      std::error_code ignored;  // the next start tries again
+      std::filesystem::remove_all(absl::StrCat(context_.jobs_directory, "/", number), ignored);
+    }
+    return absl::OkStatus();
+  });
+}
+
+absl::StatusOr<Inventory> Store::TakeInventory(bool verify_files) {
+  Inventory inventory;
+  inventory.format_version = kFormatVersion;
+  METAEKF_ASSIGN_OR_RETURN(
+      const auto files, database_->Read([&](Connection& connection) -> absl::StatusOr<OwnedFiles> {
+        METAEKF_RETURN_IF_ERROR(CountRows(connection, inventory));
+        return ListFiles(connection);
+      }));
+  for (const auto& [owner, digest] : files) {
+    if (!verify_files && access(blobs_.Path(digest).c_str(), R_OK) == 0) continue;
+    const absl::Status status = blobs_.Read(digest, owner).status();
+    if (!status.ok()) inventory.problems.emplace_back(status.message());
+  }
+  struct statvfs disk {};
+  if (statvfs(directory_.c_str(), &disk) != 0) return ErrnoStatus(errno, "cannot ask for free disk");
+  inventory.free_disk_bytes = static_cast<int64_t>(disk.f_bavail * disk.f_frsize);
+  return inventory;
+}
+
+}  // namespace metaekf::store

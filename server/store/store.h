@@ -1,0 +1,74 @@
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "server/store/adaptations.h"
+#include "server/store/blob_store.h"
+#include "server/store/context.h"
+#include "server/store/files.h"
+#include "server/store/jobs.h"
+#include "server/store/models.h"
+#include "server/store/sessions.h"
+
+namespace metaekf::store {
+
+/// What is in a data directory, and what is wrong with it.
+struct Inventory {
+  int64_t format_version = 0;
+  int64_t models = 0;
+  int64_t versions = 0;
+  int64_t adaptations = 0;
+  int64_t queued_jobs = 0;
+  int64_t running_jobs = 0;
+  int64_t ended_jobs = 0;
+  int64_t sessions = 0;
+  int64_t stored_bytes = 0;  ///< in model files and adaptations
+  int64_t free_disk_bytes = 0;
+  std::vector<std::string> problems;  ///< one sentence per file that is damaged or gone
+};
+
+/// A data directory, owned by one process: rows in an SQLite database, contents in files named by
+/// their digest. Whatever moment the process is killed at, the next Open finds every change that was
+/// confirmed, none half made, and removes files that nothing refers to.
+///
+///   DIR/lock         held while the store is open
+///   DIR/metaekf.db   the database
+///   DIR/blobs/       model files, adaptations, data of jobs
+///   DIR/tmp/         files being written
+///   DIR/jobs/N/      work directory of job N
+class Store {
+ public:
+  /// Makes the directory if there is none (its parent must exist).
+  /// Errors: FailedPrecondition if another process has it open, it cannot be written, or it is of
+  /// another format; DataLoss if the database is damaged or gone while files are still there.
+  static absl::StatusOr<std::unique_ptr<Store>> Open(const std::string& directory, Clock clock);
+
+  ModelStore& models() { return models_; }
+  AdaptationStore& adaptations() { return adaptations_; }
+  JobStore& jobs() { return jobs_; }
+  SessionStore& sessions() { return sessions_; }
+  const BlobStore& blobs() const { return blobs_; }
+
+  /// @param verify_files  reads every file and compares its digest; else only looks whether it is there.
+  absl::StatusOr<Inventory> TakeInventory(bool verify_files);
+
+ private:
+  Store(const std::string& directory, UniqueFd lock, BlobStore blobs,
+        std::unique_ptr<Database> database, Clock clock);
+  absl::Status CollectGarbage();
+
+  const std::string directory_;
+  UniqueFd lock_;
+  BlobStore blobs_;
+  std::unique_ptr<Database> database_;
+  Context context_;
+  ModelStore models_;
+  AdaptationStore adaptations_;
+  JobStore jobs_;
+  SessionStore sessions_;
+};
+
+}  // namespace metaekf::store
