@@ -1,0 +1,54 @@
+#pragma once
+
+#include <Eigen/Core>
+#include <memory>
+#include <vector>
+
+#include "core/nssm/bundle.h"
+
+namespace metaekf::filter {
+
+/// The model functions of an EKF with their Jacobians, in normalised units.
+///
+///   Case II   f(x, u) = 𝓟x𝓓x𝓐𝓔(x, u)    h(x, u) = 𝓟y𝓓y𝓔(x, u)      state x
+///   Case I    f(ψ, u) = 𝓐(ψ, u)          h(ψ) = 𝓟𝓓y(ψ)              state ψ, started by 𝓔(window)
+///
+/// Compiled once per architecture; parameters are arguments, so one FilterModel serves every adaptation of a
+/// model. Immutable and safe to share; each thread brings a Scratch. No function allocates.
+/// Source: paper.tex eqs. deep_cekf_all, jac_defs, vcc_model_for_ekf.
+class FilterModel {
+ public:
+  /// Parameters in the precision that the programs run in.
+  class Parameters {
+   public:
+    virtual ~Parameters() = default;
+  };
+  /// Memory that one thread works in.
+  class Scratch {
+   public:
+    virtual ~Scratch() = default;
+  };
+
+  static std::unique_ptr<FilterModel> Create(const nssm::Model& model);
+  virtual ~FilterModel() = default;
+
+  virtual std::unique_ptr<Parameters> Prepare(const std::vector<double>& parameters) const = 0;
+  virtual std::unique_ptr<Scratch> MakeScratch() const = 0;
+
+  /// f and F = ∂f/∂x at (x, u). @param F  n × n.
+  virtual void Transition(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
+                          Eigen::VectorXd* f, Eigen::MatrixXd* F, Scratch* scratch) const = 0;
+  /// h and H = ∂h/∂x at (x, u). @param H  n_y × n.
+  virtual void Measurement(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
+                           Eigen::VectorXd* h, Eigen::MatrixXd* H, Scratch* scratch) const = 0;
+  /// Case I: ψ = 𝓔(window), samples oldest first, each [u; y].
+  virtual void Encode(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& window, Eigen::VectorXd* latent,
+                      Scratch* scratch) const = 0;
+
+  int32_t state_size() const { return state_size_; }
+
+ protected:
+  int32_t state_size_ = 0;
+};
+
+}  // namespace metaekf::filter

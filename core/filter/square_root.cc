@@ -1,0 +1,86 @@
+#include "core/filter/square_root.h"
+
+#include <cmath>
+
+#include "absl/strings/str_cat.h"
+
+namespace metaekf::filter {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+
+void LowerTriangularise(Ref<MatrixXd> a) {
+  const Index rows = a.rows(), cols = a.cols();
+  for (Index i = 0; i < rows; ++i) {
+    // A reflection of columns i … that maps row i's tail onto ± its norm e₁.
+    double squared = 0;
+    for (Index j = i + 1; j < cols; ++j) squared += a(i, j) * a(i, j);
+    const double head = a(i, i);
+    if (squared > 0) {
+      const double norm = std::sqrt(head * head + squared);
+      const double v0 = head <= 0 ? head - norm : -squared / (head + norm);  // no cancellation
+      const double beta = 2 * v0 * v0 / (squared + v0 * v0);
+      for (Index j = i + 1; j < cols; ++j) a(i, j) /= v0;  // the reflection's vector is (1, this)
+      for (Index k = i + 1; k < rows; ++k) {
+        double dot = a(k, i);
+        for (Index j = i + 1; j < cols; ++j) dot += a(k, j) * a(i, j);
+        dot *= beta;
+        a(k, i) -= dot;
+        for (Index j = i + 1; j < cols; ++j) a(k, j) -= dot * a(i, j);
+      }
+      a(i, i) = norm;
+      for (Index j = i + 1; j < cols; ++j) a(i, j) = 0;
+    } else if (head < 0) {
+      for (Index k = i; k < rows; ++k) a(k, i) = -a(k, i);
+    }
+  }
+}
+
+absl::StatusOr<MatrixXd> SemidefiniteFactor(const MatrixXd& a) {
+  const Index n = a.rows();
+  if (a.cols() != n) return absl::InvalidArgumentError(absl::StrCat("a covariance must be square, got ", n, " × ", a.cols()));
+  if (!a.allFinite()) return absl::InvalidArgumentError("a covariance must be finite");
+  const double scale = n > 0 ? a.diagonal().cwiseAbs().maxCoeff() : 0;
+  const double tolerance = 1e-12 * static_cast<double>(n) * scale;
+  if (!(a - a.transpose()).isZero(1e-9 * scale)) return absl::InvalidArgumentError("a covariance must be symmetric");
+  MatrixXd l = MatrixXd::Zero(n, n);
+  for (Index j = 0; j < n; ++j) {
+    double pivot = a(j, j);
+    for (Index k = 0; k < j; ++k) pivot -= l(j, k) * l(j, k);
+    if (pivot < -tolerance) {
+      return absl::InvalidArgumentError(absl::StrCat("a covariance must be positive semidefinite; pivot ", j, " is ", pivot));
+    }
+    const bool zero = pivot <= tolerance;
+    l(j, j) = zero ? 0 : std::sqrt(pivot);
+    for (Index i = j + 1; i < n; ++i) {
+      double rest = a(i, j);
+      for (Index k = 0; k < j; ++k) rest -= l(i, k) * l(j, k);
+      // A direction without variance has no covariance with others either.
+      if (zero && std::fabs(rest) > std::sqrt(tolerance * scale) + tolerance) {
+        return absl::InvalidArgumentError(absl::StrCat("a covariance must be positive semidefinite; see row ", i));
+      }
+      l(i, j) = zero ? 0 : rest / l(j, j);
+    }
+  }
+  return l;
+}
+
+void FactorTimeUpdate(const MatrixXd& F, const MatrixXd& process_factor, MatrixXd* work, MatrixXd* factor) {
+  const Index n = factor->rows();
+  work->leftCols(n).noalias() = F.lazyProduct(*factor);
+  work->rightCols(n) = process_factor;
+  LowerTriangularise(*work);
+  *factor = work->leftCols(n);
+}
+
+void FactorMeasurementUpdate(const Ref<const MatrixXd>& H_rows, Ref<MatrixXd> work, MatrixXd* factor) {
+  const Index m = H_rows.rows(), n = factor->rows();
+  work.topRightCorner(m, n).noalias() = H_rows.lazyProduct(*factor);
+  work.bottomLeftCorner(n, m).setZero();
+  work.bottomRightCorner(n, n) = *factor;
+  LowerTriangularise(work);
+  *factor = work.bottomRightCorner(n, n);
+}
+
+}  // namespace metaekf::filter
