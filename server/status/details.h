@@ -7,8 +7,8 @@
 #include "absl/status/status.h"
 #include "absl/time/time.h"
 
-/// Details that programs can read, carried by an absl::Status as payloads (google.rpc messages) until
-/// ToGrpcStatus sends them. No gRPC here: any part of the server may use it.
+/// Details that programs can read, carried by an absl::Status as payloads (google.rpc messages)
+/// until ToGrpcStatus sends them. No gRPC here: any part of the server may use it.
 namespace metaekf::server {
 
 /// One wrong field of a request.
@@ -20,7 +20,7 @@ struct Violation {
 /// InvalidArgument for one wrong field; message "FIELD: DESCRIPTION".
 absl::Status FieldViolation(const std::string& field, const std::string& description);
 
-/// InvalidArgument for all of `violations`, the first eight of them spelt out; OK if there are none.
+/// InvalidArgument for all of `violations`, the first eight spelt out; OK if there are none.
 absl::Status FieldViolations(const std::vector<Violation>& violations);
 
 /// `status` with a reason for programs (google.rpc.ErrorInfo of domain "metaekf"),
@@ -31,7 +31,7 @@ absl::Status WithReason(absl::Status status, const std::string& reason,
 /// `status` with the time after which trying again makes sense (google.rpc.RetryInfo).
 absl::Status WithRetryDelay(absl::Status status, absl::Duration delay);
 
-/// `status` with the resource it is about (google.rpc.ResourceInfo), e.g. ("model", "models/robot").
+/// `status` with the resource it is about (google.rpc.ResourceInfo): ("model", "models/robot").
 absl::Status WithResource(absl::Status status, const std::string& type, const std::string& name);
 
 }  // namespace metaekf::server

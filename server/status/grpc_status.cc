@@ -8,7 +8,7 @@
 namespace metaekf::server {
 namespace {
 
-// At worst a message is percent-encoded (× 3) and the details, which repeat it, are in base 64 (× 4/3).
+// At worst a message is percent-encoded (× 3) and the details, which repeat it, are in base 64.
 constexpr size_t kMaxMessageBytes = 600;
 constexpr size_t kMaxDetailsBytes = 3584;
 constexpr std::string_view kDetailPrefix = "type.googleapis.com/google.rpc.";

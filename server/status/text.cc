@@ -31,8 +31,8 @@ std::string HidePaths(std::string_view text) {
   std::string result;
   for (size_t i = 0; i < text.size();) {
     const bool word_starts = i == 0 || SeparatesWords(text[i - 1]);
-    const bool path = word_starts && text[i] == '/' && i + 1 < text.size() &&
-                      text[i + 1] != '/' && !SeparatesWords(text[i + 1]);
+    const bool path = word_starts && text[i] == '/' && i + 1 < text.size() && text[i + 1] != '/' &&
+                      !SeparatesWords(text[i + 1]);
     if (!path) {
       result += text[i++];
       continue;

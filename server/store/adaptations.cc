@@ -12,8 +12,13 @@ constexpr const char* kSelect =
     "WHERE tenant = ?1 ";
 
 Adaptation ReadAdaptation(const Row& row) {
-  return {row.Text(0), row.Text(1), row.Int(2), row.Text(3),
-          row.Int(4),  row.Text(5), absl::FromUnixMicros(row.Int(6))};
+  return {row.Text(0),
+          row.Text(1),
+          row.Int(2),
+          row.Text(3),
+          row.Int(4),
+          row.Text(5),
+          absl::FromUnixMicros(row.Int(6))};
 }
 
 absl::StatusOr<Adaptation> Find(const Context& context, Connection& connection,
@@ -73,8 +78,8 @@ absl::StatusOr<Adaptation> AdaptationStore::Create(NewAdaptation wanted) {
     if (before) return Find(context_, connection, before->name);
     const absl::Status taken = Find(context_, connection, wanted.id).status();
     if (taken.ok()) {
-      return absl::AlreadyExistsError(absl::StrCat(
-          "there is an adaptation '", wanted.id, "'; choose another id or delete that one"));
+      return absl::AlreadyExistsError(absl::StrCat("there is an adaptation '", wanted.id,
+                                                   "'; choose another id or delete that one"));
     }
     if (!absl::IsNotFound(taken)) return taken;
     METAEKF_ASSIGN_OR_RETURN(Adaptation adaptation, Insert(context_, connection, wanted));
@@ -105,10 +110,10 @@ absl::StatusOr<Page<Adaptation>> AdaptationStore::List(const PageRequest& reques
   METAEKF_ASSIGN_OR_RETURN(const PageCursor cursor, ParsePage(list, request));
   return context_.database.Read([&](Connection& connection) -> absl::StatusOr<Page<Adaptation>> {
     std::vector<Adaptation> adaptations;
-    METAEKF_RETURN_IF_ERROR(connection.Execute(
-        absl::StrCat(kSelect, "AND id > ?2 ORDER BY id LIMIT ?3"),
-        {context_.tenant, cursor.after, cursor.size + 1},
-        [&](const Row& row) { adaptations.push_back(ReadAdaptation(row)); }));
+    METAEKF_RETURN_IF_ERROR(
+        connection.Execute(absl::StrCat(kSelect, "AND id > ?2 ORDER BY id LIMIT ?3"),
+                           {context_.tenant, cursor.after, cursor.size + 1},
+                           [&](const Row& row) { adaptations.push_back(ReadAdaptation(row)); }));
     return MakePage(list, cursor, std::move(adaptations),
                     [](const Adaptation& adaptation) { return adaptation.id; });
   });
@@ -119,9 +124,8 @@ absl::Status AdaptationStore::Delete(const std::string& id) {
       const Adaptation deleted,
       context_.database.Write([&](Connection& connection) -> absl::StatusOr<Adaptation> {
         METAEKF_ASSIGN_OR_RETURN(Adaptation found, Find(context_, connection, id));
-        METAEKF_RETURN_IF_ERROR(
-            connection.Execute("DELETE FROM adaptations WHERE tenant = ?1 AND id = ?2",
-                               {context_.tenant, id}));
+        METAEKF_RETURN_IF_ERROR(connection.Execute(
+            "DELETE FROM adaptations WHERE tenant = ?1 AND id = ?2", {context_.tenant, id}));
         return found;
       }));
   RemoveIfUnreferenced(context_, deleted.digest);
@@ -129,8 +133,8 @@ absl::Status AdaptationStore::Delete(const std::string& id) {
 }
 
 absl::StatusOr<std::string> AdaptationStore::ReadFile(const Adaptation& adaptation) {
-  auto bytes = context_.blobs.Read(adaptation.digest,
-                                   absl::StrCat("adaptation '", adaptation.id, "'"));
+  auto bytes =
+      context_.blobs.Read(adaptation.digest, absl::StrCat("adaptation '", adaptation.id, "'"));
   // One deleted meanwhile is no loss.
   if (!bytes.ok()) METAEKF_RETURN_IF_ERROR(Get(adaptation.id).status());
   return bytes;

@@ -36,8 +36,8 @@ class AdaptationStore {
  public:
   explicit AdaptationStore(Context context) : context_(std::move(context)) {}
 
-  /// Errors: NotFound if the version is gone; AlreadyExists if the id is taken or the request.id was
-  /// used with another fingerprint.
+  /// Errors: NotFound if the version is gone; AlreadyExists if the id is taken or the request.id
+  /// was used with another fingerprint.
   absl::StatusOr<Adaptation> Create(NewAdaptation adaptation);
 
   /// What `request` made before, if it did: so that a repeated request need not adapt again.

@@ -14,17 +14,17 @@ constexpr const char* kReferenced =
 absl::StatusOr<int64_t> NextNumber(const Context& context, Connection& connection,
                                    const std::string& kind) {
   int64_t number = 0;
-  METAEKF_RETURN_IF_ERROR(connection.Execute(
-      "INSERT INTO counters VALUES (?1, ?2, 1) "
-      "ON CONFLICT DO UPDATE SET value = value + 1 RETURNING value",
-      {context.tenant, kind}, [&](const Row& row) { number = row.Int(0); }));
+  METAEKF_RETURN_IF_ERROR(
+      connection.Execute("INSERT INTO counters VALUES (?1, ?2, 1) "
+                         "ON CONFLICT DO UPDATE SET value = value + 1 RETURNING value",
+                         {context.tenant, kind}, [&](const Row& row) { number = row.Int(0); }));
   return number;
 }
 
 absl::StatusOr<std::vector<std::string>> ReferencedBlobs(Connection& connection) {
   std::vector<std::string> digests;
-  METAEKF_RETURN_IF_ERROR(connection.Execute(
-      kReferenced, {}, [&](const Row& row) { digests.push_back(row.Text(0)); }));
+  METAEKF_RETURN_IF_ERROR(
+      connection.Execute(kReferenced, {}, [&](const Row& row) { digests.push_back(row.Text(0)); }));
   return digests;
 }
 

@@ -27,7 +27,7 @@ struct Context {
 absl::StatusOr<int64_t> NextNumber(const Context& context, Connection& connection,
                                    const std::string& kind);
 
-/// All blobs that something refers to: model files, adaptations, and data of jobs that may still run.
+/// All blobs that something refers to: model files, adaptations, data of jobs that may still run.
 absl::StatusOr<std::vector<std::string>> ReferencedBlobs(Connection& connection);
 
 /// Removes a blob unless something refers to it. After the commit that dropped a reference; what a

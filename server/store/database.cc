@@ -124,8 +124,8 @@ absl::StatusOr<std::unique_ptr<Database>> Database::Open(const std::string& path
   METAEKF_ASSIGN_OR_RETURN(auto writer, Connection::Open(path, Connection::Mode::kReadWrite));
   METAEKF_RETURN_IF_ERROR(writer->Execute("PRAGMA journal_mode = WAL"));
   std::string verdict;
-  METAEKF_RETURN_IF_ERROR(writer->Execute("PRAGMA quick_check(1)", {},
-                                          [&](const Row& row) { verdict = row.Text(0); }));
+  METAEKF_RETURN_IF_ERROR(
+      writer->Execute("PRAGMA quick_check(1)", {}, [&](const Row& row) { verdict = row.Text(0); }));
   if (verdict != "ok") return absl::DataLossError(absl::StrCat("database: damaged: ", verdict));
   return std::unique_ptr<Database>(new Database(path, std::move(writer)));
 }

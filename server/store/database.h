@@ -47,7 +47,8 @@ class Connection {
 
   /// Runs one statement with parameters ?1, ?2, … and calls `on_row` for every row of its result.
   /// Errors: ResourceExhausted when the disk is full, DataLoss for a damaged file,
-  /// FailedPrecondition if it cannot be opened or written, Unavailable if it is locked from outside, Internal.
+  /// FailedPrecondition if it cannot be opened or written, Unavailable if it is locked from
+  /// outside, Internal.
   absl::Status Execute(const std::string& sql, std::initializer_list<Value> parameters = {},
                        const std::function<void(const Row&)>& on_row = nullptr);
   /// Rows that the last INSERT, UPDATE or DELETE changed.
@@ -72,8 +73,9 @@ class Database {
   /// Errors: as Connection::Execute; DataLoss if the file does not pass SQLite's own check.
   static absl::StatusOr<std::unique_ptr<Database>> Open(const std::string& path);
 
-  /// Runs `work`, which takes the connection and returns an absl::Status or StatusOr, in a transaction
-  /// that alone may write; commits if that is OK. Returns what `work` returned, or why the commit failed.
+  /// Runs `work`, which takes the connection and returns an absl::Status or StatusOr, in a
+  /// transaction that alone may write; commits if that is OK. Returns what `work` returned, or why
+  /// the commit failed.
   template <class Work>
   auto Write(const Work& work) {
     return Run(&Database::WriteTransaction, work);

@@ -67,9 +67,9 @@ absl::Status Update(const Context& context, Connection& connection, const Job& j
       "UPDATE jobs SET state = ?3, attempt = ?4, failures = ?5, worker = ?6, lease_end = ?7, "
       "progress_json = ?8, error = ?9, result_version = ?10, start_time = ?11, end_time = ?12 "
       "WHERE tenant = ?1 AND number = ?2",
-      {context.tenant, job.number, Name(job.state), job.attempt,
-       job.failures, job.worker, absl::ToUnixMicros(job.lease_end), job.progress_json, job.error,
-       job.result_version, absl::ToUnixMicros(job.start_time), absl::ToUnixMicros(job.end_time)});
+      {context.tenant, job.number, Name(job.state), job.attempt, job.failures, job.worker,
+       absl::ToUnixMicros(job.lease_end), job.progress_json, job.error, job.result_version,
+       absl::ToUnixMicros(job.start_time), absl::ToUnixMicros(job.end_time)});
 }
 
 void End(const Context& context, JobState state, Job& job) {
@@ -117,10 +117,10 @@ absl::StatusOr<Page<Job>> JobStore::List(const PageRequest& request) {
   METAEKF_ASSIGN_OR_RETURN(const PageCursor cursor, ParsePage(list, request));
   return context_.database.Read([&](Connection& connection) -> absl::StatusOr<Page<Job>> {
     std::vector<Job> jobs;
-    METAEKF_RETURN_IF_ERROR(connection.Execute(
-        absl::StrCat(kSelect, "AND number < ?2 ORDER BY number DESC LIMIT ?3"),
-        {context_.tenant, NumberLimit(cursor), cursor.size + 1},
-        [&](const Row& row) { jobs.push_back(ReadJob(row)); }));
+    METAEKF_RETURN_IF_ERROR(
+        connection.Execute(absl::StrCat(kSelect, "AND number < ?2 ORDER BY number DESC LIMIT ?3"),
+                           {context_.tenant, NumberLimit(cursor), cursor.size + 1},
+                           [&](const Row& row) { jobs.push_back(ReadJob(row)); }));
     return MakePage(list, cursor, std::move(jobs),
                     [](const Job& job) { return absl::StrCat(job.number); });
   });
@@ -130,9 +130,9 @@ absl::StatusOr<std::optional<Job>> JobStore::Claim(const std::string& worker,
                                                    absl::Duration lease) {
   using Claimed = absl::StatusOr<std::optional<Job>>;
   return context_.database.Write([&](Connection& connection) -> Claimed {
-    METAEKF_ASSIGN_OR_RETURN(auto job, SelectJob(context_, connection,
-                                                 "AND state = ?2 ORDER BY number LIMIT 1",
-                                                 "QUEUED"));
+    METAEKF_ASSIGN_OR_RETURN(
+        auto job,
+        SelectJob(context_, connection, "AND state = ?2 ORDER BY number LIMIT 1", "QUEUED"));
     if (!job) return std::nullopt;
     job->state = JobState::kRunning;
     ++job->attempt;
@@ -221,8 +221,8 @@ absl::Status JobStore::LoseExpired() {
         return jobs;
       }));
   for (const Job& job : expired) {
-    const absl::Status lost = Lose({job.number, job.attempt},
-                                   absl::StrCat("worker ", job.worker, " stopped reporting"));
+    const absl::Status lost =
+        Lose({job.number, job.attempt}, absl::StrCat("worker ", job.worker, " stopped reporting"));
     // It ended by itself meanwhile.
     if (!lost.ok() && !absl::IsAborted(lost)) return lost;
   }

@@ -21,8 +21,8 @@ struct Job {
   std::string worker;    ///< who has it, or had it last
   absl::Time lease_end;  ///< of kRunning
   std::string progress_json;
-  std::string error;          ///< of kFailed, or why the last attempt was lost
-  int64_t result_version = 0; ///< of kSucceeded
+  std::string error;           ///< of kFailed, or why the last attempt was lost
+  int64_t result_version = 0;  ///< of kSucceeded
   absl::Time create_time;
   absl::Time start_time;  ///< of the latest attempt; 1970 before the first
   absl::Time end_time;    ///< 1970 before the end
@@ -64,7 +64,7 @@ class JobStore {
   /// @param worker  unique per start of a worker.
   absl::StatusOr<std::optional<Job>> Claim(const std::string& worker, absl::Duration lease);
   /// Extends the lease and tells the progress.
-  /// @param checkpointed  a checkpoint has been written since the last call: the attempt got somewhere.
+  /// @param checkpointed  a checkpoint was written since the last call: the attempt got somewhere.
   absl::Status Renew(const JobLease& lease, absl::Duration duration,
                      const std::string& progress_json, bool checkpointed);
 
@@ -80,7 +80,7 @@ class JobStore {
 
   /// Loses the jobs whose lease has ended.
   absl::Status LoseExpired();
-  /// Queues all running jobs again: at a start, when no worker of an earlier server counts any more.
+  /// Queues all running jobs again: at a start, when workers of an earlier server do not count.
   absl::Status GiveBackAll();
 
   /// Ends a job that has not ended; no change if it was cancelled before.

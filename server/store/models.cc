@@ -35,16 +35,17 @@ absl::Status NoSuchAlias(const std::string& model, const std::string& alias) {
 absl::Status ReadAliases(const Context& context, Connection& connection, Model& model) {
   return connection.Execute(
       "SELECT alias, version FROM aliases WHERE tenant = ?1 AND model = ?2 ORDER BY alias",
-      {context.tenant, model.name},
-      [&](const Row& row) { model.aliases.push_back({row.Text(0), row.Int(1)}); });
+      {context.tenant, model.name}, [&](const Row& row) {
+        model.aliases.push_back({row.Text(0), row.Int(1)});
+      });
 }
 
 absl::StatusOr<ModelVersion> FindVersion(const Context& context, Connection& connection,
                                          const std::string& model, int64_t version) {
   std::optional<ModelVersion> found;
-  METAEKF_RETURN_IF_ERROR(connection.Execute(
-      absl::StrCat(kSelectVersion, "AND version = ?3"), {context.tenant, model, version},
-      [&](const Row& row) { found = ReadVersion(row); }));
+  METAEKF_RETURN_IF_ERROR(connection.Execute(absl::StrCat(kSelectVersion, "AND version = ?3"),
+                                             {context.tenant, model, version},
+                                             [&](const Row& row) { found = ReadVersion(row); }));
   if (found) return *std::move(found);
   return absl::NotFoundError(absl::StrCat("model '", model, "' has no version ", version));
 }
@@ -58,8 +59,8 @@ absl::Status CheckUnused(const Context& context, Connection& connection, const s
       "WHERE tenant = ?1 AND model = ?2 AND version = ?3 LIMIT 1",
       {context.tenant, model, version}, [&](const Row& row) { user = row.Text(0); }));
   if (user.empty()) return absl::OkStatus();
-  return absl::FailedPreconditionError(absl::StrCat("version ", version, " of model '", model,
-                                                    "' is in use by ", user, "; delete that first"));
+  return absl::FailedPreconditionError(absl::StrCat(
+      "version ", version, " of model '", model, "' is in use by ", user, "; delete that first"));
 }
 
 }  // namespace
@@ -72,12 +73,11 @@ absl::StatusOr<ModelVersion> InsertVersion(const Context& context, Connection& c
                            NextNumber(context, connection, absl::StrCat("version of ", model)));
   // To microseconds, as it will be read back.
   const int64_t now = absl::ToUnixMicros(context.clock());
-  ModelVersion version{model,         number, file.digest(), file.size_bytes(),
-                       metadata_json, absl::FromUnixMicros(now)};
-  METAEKF_RETURN_IF_ERROR(
-      connection.Execute("INSERT INTO versions VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7)",
-                         {context.tenant, model, number, version.digest, version.size_bytes,
-                          metadata_json, now}));
+  ModelVersion version{
+      model, number, file.digest(), file.size_bytes(), metadata_json, absl::FromUnixMicros(now)};
+  METAEKF_RETURN_IF_ERROR(connection.Execute(
+      "INSERT INTO versions VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7)",
+      {context.tenant, model, number, version.digest, version.size_bytes, metadata_json, now}));
   METAEKF_RETURN_IF_ERROR(context.blobs.Publish(file));
   return version;
 }
@@ -128,9 +128,8 @@ absl::StatusOr<Page<Model>> ModelStore::List(const PageRequest& request) {
 
 absl::StatusOr<ModelVersion> ModelStore::GetVersion(const std::string& model, int64_t version) {
   METAEKF_RETURN_IF_ERROR(CheckName("model name", model));
-  return context_.database.Read([&](Connection& connection) {
-    return FindVersion(context_, connection, model, version);
-  });
+  return context_.database.Read(
+      [&](Connection& connection) { return FindVersion(context_, connection, model, version); });
 }
 
 absl::StatusOr<ModelVersion> ModelStore::GetLatest(const std::string& model) {
@@ -203,9 +202,9 @@ absl::Status ModelStore::SetAlias(const std::string& model, const std::string& a
 
 absl::Status ModelStore::DeleteAlias(const std::string& model, const std::string& alias) {
   return context_.database.Write([&](Connection& connection) -> absl::Status {
-    METAEKF_RETURN_IF_ERROR(connection.Execute(
-        "DELETE FROM aliases WHERE tenant = ?1 AND model = ?2 AND alias = ?3",
-        {context_.tenant, model, alias}));
+    METAEKF_RETURN_IF_ERROR(
+        connection.Execute("DELETE FROM aliases WHERE tenant = ?1 AND model = ?2 AND alias = ?3",
+                           {context_.tenant, model, alias}));
     if (connection.changes() > 0) return absl::OkStatus();
     return NoSuchAlias(model, alias);
   });

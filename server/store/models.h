@@ -32,8 +32,8 @@ struct Model {
   std::vector<Alias> aliases;
 };
 
-/// Models and their versions, which never change once they are listed. A model is there while it has
-/// a version. Safe to call concurrently.
+/// Models and their versions, which never change once they are listed. A model is there while it
+/// has a version. Safe to call concurrently.
 ///
 /// Errors of all: InvalidArgument for a name that names.h refuses; NotFound; the database's own.
 class ModelStore {

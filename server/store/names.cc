@@ -16,9 +16,8 @@ bool IsLetterOrDigit(char c) { return absl::ascii_islower(c) || absl::ascii_isdi
 
 absl::Status CheckName(const std::string& what, const std::string& name) {
   const bool valid = !name.empty() && name.size() <= kMaxLength && IsLetterOrDigit(name[0]) &&
-                     std::all_of(name.begin(), name.end(), [](char c) {
-                       return IsLetterOrDigit(c) || c == '_' || c == '-';
-                     });
+                     std::all_of(name.begin(), name.end(),
+                                 [](char c) { return IsLetterOrDigit(c) || c == '_' || c == '-'; });
   if (valid) return absl::OkStatus();
   return absl::InvalidArgumentError(
       absl::StrCat(what, " '", name.substr(0, kMaxLength + 1),

@@ -27,9 +27,8 @@ absl::StatusOr<PageCursor> ParsePage(const std::string& list, const PageRequest&
     return absl::InvalidArgumentError(
         absl::StrCat("page_size is ", request.page_size, ", must not be negative"));
   }
-  const int64_t size = request.page_size == 0
-                           ? kDefaultPageSize
-                           : std::min<int64_t>(request.page_size, kMaxPageSize);
+  const int64_t size = request.page_size == 0 ? kDefaultPageSize
+                                              : std::min<int64_t>(request.page_size, kMaxPageSize);
   if (request.page_token.empty()) return PageCursor{size, ""};
   std::string text;
   if (!absl::WebSafeBase64Unescape(request.page_token, &text) || text.size() < kCheckLength ||

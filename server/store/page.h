@@ -8,8 +8,8 @@
 
 namespace metaekf::store {
 
-/// Which page of a list: at most `page_size` items (0: 50, more than 1000: 1000) after what the token
-/// of the page before says (empty: from the start).
+/// Which page of a list: at most `page_size` items (0: 50, more than 1000: 1000) after what the
+/// token of the page before says (empty: from the start).
 struct PageRequest {
   int32_t page_size = 0;
   std::string page_token;

@@ -21,13 +21,13 @@ absl::StatusOr<std::optional<RequestResult>> FindRequest(const Context& context,
   std::optional<RequestResult> result;
   std::string fingerprint;
   if (request.id.empty()) return result;
-  METAEKF_RETURN_IF_ERROR(connection.Execute(
-      "SELECT fingerprint, name, number FROM request_ids "
-      "WHERE tenant = ?1 AND kind = ?2 AND request_id = ?3",
-      {context.tenant, kind, request.id}, [&](const Row& row) {
-        fingerprint = row.Text(0);
-        result = RequestResult{row.Text(1), row.Int(2)};
-      }));
+  METAEKF_RETURN_IF_ERROR(
+      connection.Execute("SELECT fingerprint, name, number FROM request_ids "
+                         "WHERE tenant = ?1 AND kind = ?2 AND request_id = ?3",
+                         {context.tenant, kind, request.id}, [&](const Row& row) {
+                           fingerprint = row.Text(0);
+                           result = RequestResult{row.Text(1), row.Int(2)};
+                         }));
   if (result && fingerprint != request.fingerprint) {
     return absl::AlreadyExistsError(absl::StrCat(
         "request_id '", request.id, "' was used for another request; give each its own"));

@@ -22,7 +22,8 @@ struct RequestResult {
 };
 
 /// What `request` made before, if it did.
-/// Errors: InvalidArgument for too long an id; AlreadyExists if the id was used with another fingerprint.
+/// Errors: InvalidArgument for too long an id; AlreadyExists if the id was used with another
+/// fingerprint.
 absl::StatusOr<std::optional<RequestResult>> FindRequest(const Context& context,
                                                          Connection& connection,
                                                          const std::string& kind,

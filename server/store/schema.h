@@ -5,8 +5,8 @@
 
 namespace metaekf::store {
 
-/// The format of a data directory, kept in the database's user_version. Raise it with every change of
-/// the tables or of the directory's layout, and bring older ones up to date in PrepareSchema.
+/// The format of a data directory, kept in the database's user_version. Raise it with every change
+/// of the tables or of the directory's layout, and bring older ones up to date in PrepareSchema.
 constexpr int64_t kFormatVersion = 1;
 
 /// Makes the tables in a new database.

@@ -17,8 +17,13 @@ constexpr const char* kSelect =
     "WHERE tenant = ?1 ";
 
 Session ReadSession(const Row& row) {
-  return {row.Int(0), row.Text(1), row.Text(2),
-          row.Int(3), row.Int(4),  row.Text(5), absl::FromUnixMicros(row.Int(6))};
+  return {row.Int(0),
+          row.Text(1),
+          row.Text(2),
+          row.Int(3),
+          row.Int(4),
+          row.Text(5),
+          absl::FromUnixMicros(row.Int(6))};
 }
 
 absl::StatusOr<Session> Find(const Context& context, Connection& connection, int64_t number) {
@@ -57,10 +62,10 @@ absl::StatusOr<NewSession> SessionStore::Create(const std::string& target,
 
 absl::StatusOr<Session> SessionStore::Claim(int64_t number, const std::string& token) {
   return context_.database.Write([&](Connection& connection) -> absl::StatusOr<Session> {
-    METAEKF_RETURN_IF_ERROR(connection.Execute(
-        "UPDATE sessions SET epoch = epoch + 1 "
-        "WHERE tenant = ?1 AND number = ?2 AND token_digest = ?3",
-        {context_.tenant, number, Sha256Hex(token)}));
+    METAEKF_RETURN_IF_ERROR(
+        connection.Execute("UPDATE sessions SET epoch = epoch + 1 "
+                           "WHERE tenant = ?1 AND number = ?2 AND token_digest = ?3",
+                           {context_.tenant, number, Sha256Hex(token)}));
     if (connection.changes() > 0) return Find(context_, connection, number);
     return absl::NotFoundError(absl::StrCat("there is no session ", number, " with this token"));
   });
@@ -71,11 +76,11 @@ absl::StatusOr<std::vector<bool>> SessionStore::SaveCheckpoints(
   return context_.database.Write([&](Connection& connection) -> absl::StatusOr<std::vector<bool>> {
     std::vector<bool> written;
     for (const SessionCheckpoint& checkpoint : checkpoints) {
-      METAEKF_RETURN_IF_ERROR(connection.Execute(
-          "UPDATE sessions SET durable_seq = ?4, checkpoint = ?5 "
-          "WHERE tenant = ?1 AND number = ?2 AND epoch = ?3",
-          {context_.tenant, checkpoint.number, checkpoint.epoch, checkpoint.durable_seq,
-           Bytes{checkpoint.checkpoint}}));
+      METAEKF_RETURN_IF_ERROR(
+          connection.Execute("UPDATE sessions SET durable_seq = ?4, checkpoint = ?5 "
+                             "WHERE tenant = ?1 AND number = ?2 AND epoch = ?3",
+                             {context_.tenant, checkpoint.number, checkpoint.epoch,
+                              checkpoint.durable_seq, Bytes{checkpoint.checkpoint}}));
       written.push_back(connection.changes() > 0);
     }
     return written;
@@ -92,10 +97,10 @@ absl::StatusOr<Page<Session>> SessionStore::List(const PageRequest& request) {
   METAEKF_ASSIGN_OR_RETURN(const PageCursor cursor, ParsePage(list, request));
   return context_.database.Read([&](Connection& connection) -> absl::StatusOr<Page<Session>> {
     std::vector<Session> sessions;
-    METAEKF_RETURN_IF_ERROR(connection.Execute(
-        absl::StrCat(kSelect, "AND number < ?2 ORDER BY number DESC LIMIT ?3"),
-        {context_.tenant, NumberLimit(cursor), cursor.size + 1},
-        [&](const Row& row) { sessions.push_back(ReadSession(row)); }));
+    METAEKF_RETURN_IF_ERROR(
+        connection.Execute(absl::StrCat(kSelect, "AND number < ?2 ORDER BY number DESC LIMIT ?3"),
+                           {context_.tenant, NumberLimit(cursor), cursor.size + 1},
+                           [&](const Row& row) { sessions.push_back(ReadSession(row)); }));
     return MakePage(list, cursor, std::move(sessions),
                     [](const Session& session) { return absl::StrCat(session.number); });
   });
@@ -103,9 +108,8 @@ absl::StatusOr<Page<Session>> SessionStore::List(const PageRequest& request) {
 
 absl::Status SessionStore::Delete(int64_t number) {
   return context_.database.Write([&](Connection& connection) -> absl::Status {
-    METAEKF_RETURN_IF_ERROR(
-        connection.Execute("DELETE FROM sessions WHERE tenant = ?1 AND number = ?2",
-                           {context_.tenant, number}));
+    METAEKF_RETURN_IF_ERROR(connection.Execute(
+        "DELETE FROM sessions WHERE tenant = ?1 AND number = ?2", {context_.tenant, number}));
     if (connection.changes() > 0) return absl::OkStatus();
     return absl::NotFoundError(absl::StrCat("there is no session ", number));
   });

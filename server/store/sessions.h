@@ -32,8 +32,8 @@ struct SessionCheckpoint {
   std::string checkpoint;
 };
 
-/// Estimation sessions. The epoch is a fencing token: who claims a session takes it from whoever had
-/// it before. Safe to call concurrently.
+/// Estimation sessions. The epoch is a fencing token: who claims a session takes it from whoever
+/// had it before. Safe to call concurrently.
 class SessionStore {
  public:
   explicit SessionStore(Context context) : context_(std::move(context)) {}

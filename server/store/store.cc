@@ -41,9 +41,10 @@ absl::Status CheckDatabaseNotLost(const std::string& directory, const BlobStore&
   if (access(DatabasePath(directory).c_str(), F_OK) == 0) return absl::OkStatus();
   METAEKF_ASSIGN_OR_RETURN(const auto files, blobs.List());
   if (files.empty()) return absl::OkStatus();
-  return absl::DataLossError(absl::StrCat(
-      directory, " has ", files.size(), " stored files but no metaekf.db; restore that file from a ",
-      "backup, or remove the directory to start anew"));
+  return absl::DataLossError(
+      absl::StrCat(directory, " has ", files.size(),
+                   " stored files but no metaekf.db; restore that file from a ",
+                   "backup, or remove the directory to start anew"));
 }
 
 absl::Status CountRows(Connection& connection, Inventory& inventory) {
@@ -145,7 +146,8 @@ absl::StatusOr<Inventory> Store::TakeInventory(bool verify_files) {
     if (!status.ok()) inventory.problems.emplace_back(status.message());
   }
   struct statvfs disk {};
-  if (statvfs(directory_.c_str(), &disk) != 0) return ErrnoStatus(errno, "cannot ask for free disk");
+  if (statvfs(directory_.c_str(), &disk) != 0)
+    return ErrnoStatus(errno, "cannot ask for free disk");
   inventory.free_disk_bytes = static_cast<int64_t>(disk.f_bavail * disk.f_frsize);
   return inventory;
 }

@@ -31,8 +31,8 @@ struct Inventory {
 };
 
 /// A data directory, owned by one process: rows in an SQLite database, contents in files named by
-/// their digest. Whatever moment the process is killed at, the next Open finds every change that was
-/// confirmed, none half made, and removes files that nothing refers to.
+/// their digest. Whatever moment the process is killed at, the next Open finds every change that
+/// was confirmed, none half made, and removes files that nothing refers to.
 ///
 ///   DIR/lock         held while the store is open
 ///   DIR/metaekf.db   the database
@@ -52,7 +52,8 @@ class Store {
   SessionStore& sessions() { return sessions_; }
   const BlobStore& blobs() const { return blobs_; }
 
-  /// @param verify_files  reads every file and compares its digest; else only looks whether it is there.
+  /// @param verify_files  reads every file and compares its digest; else only looks whether it is
+  /// there.
   absl::StatusOr<Inventory> TakeInventory(bool verify_files);
 
  private:

@@ -15,8 +15,8 @@ TEST(TextForClientsTest, HidesAbsolutePaths) {
 }
 
 TEST(TextForClientsTest, KeepsWhatIsNoPath) {
-  for (const char* text : {"models/robot/versions/3", "1.5 m/s", "a / b", "see https://example.org/x",
-                           "ends in /", "ψ⁺ = 𝓐(ψ)"}) {
+  for (const char* text : {"models/robot/versions/3", "1.5 m/s", "a / b",
+                           "see https://example.org/x", "ends in /", "ψ⁺ = 𝓐(ψ)"}) {
     EXPECT_EQ(TextForClients(text, kPlenty), text);
   }
 }

@@ -18,7 +18,8 @@ class AdaptationsTest : public StoreTest {
     AddVersion("robot");
   }
   absl::StatusOr<Adaptation> Create(const std::string& id, const RequestId& request = {}) {
-    return store_->adaptations().Create({id, "robot", 1, Blob("subset"), R"({"steps": 5})", request});
+    return store_->adaptations().Create(
+        {id, "robot", 1, Blob("subset"), R"({"steps": 5})", request});
   }
 };
 

@@ -80,16 +80,17 @@ class Writer {
     const auto latest = store_.models().GetLatest(ModelName(model));
     if (!latest.ok()) return;
     Tell({Report::kDeleting, model, latest->version});
-    store_.models().DeleteVersion(ModelName(model), latest->version).IgnoreError();  // may be in use
+    store_.models()
+        .DeleteVersion(ModelName(model), latest->version)
+        .IgnoreError();  // may be in use
   }
 
   void Adapt() {
     const auto latest = store_.models().GetLatest("m0");
     if (!latest.ok()) return;
-    const auto adaptation =
-        store_.adaptations()
-            .Create({"", "m0", latest->version, RandomBlob(20'000), "{}", {}})
-            .value();
+    const auto adaptation = store_.adaptations()
+                                .Create({"", "m0", latest->version, RandomBlob(20'000), "{}", {}})
+                                .value();
     if (rng_.Index(2) == 0) store_.adaptations().Delete(adaptation.id).IgnoreError();
   }
 
@@ -99,7 +100,8 @@ class Writer {
     const JobLease lease{job->number, job->attempt};
     store_.jobs().WorkDirectory(job->number).value();
     if (!store_.jobs().Renew(lease, absl::Seconds(30), "{}", true).ok()) _exit(4);
-    if (!store_.jobs().Publish(lease, RandomBlob(100'000), absl::StrCat(job->number)).ok()) _exit(5);
+    if (!store_.jobs().Publish(lease, RandomBlob(100'000), absl::StrCat(job->number)).ok())
+      _exit(5);
   }
 
   Store& store_;

@@ -35,15 +35,16 @@ class DatabaseTest : public testing::Test {
 TEST_F(DatabaseTest, ValuesComeBackAsTheyWere) {
   const std::string bytes("\0\xFFx", 3);
   ASSERT_TRUE(Write("INSERT INTO t VALUES (?1, ?2), (?3, ?4)",
-                    {int64_t{1} << 62, Bytes{bytes}, nullptr, "text"}).ok());
+                    {int64_t{1} << 62, Bytes{bytes}, nullptr, "text"})
+                  .ok());
   std::vector<std::pair<int64_t, std::string>> rows;
   const auto read = database_->Read([&](Connection& c) {
     return c.Execute("SELECT n, b FROM t ORDER BY rowid", {},
                      [&](const Row& row) { rows.emplace_back(row.Int(0), row.Text(1)); });
   });
   ASSERT_TRUE(read.ok()) << read;
-  EXPECT_EQ(rows, (std::vector<std::pair<int64_t, std::string>>{{int64_t{1} << 62, bytes},
-                                                                {0, "text"}}));
+  EXPECT_EQ(rows,
+            (std::vector<std::pair<int64_t, std::string>>{{int64_t{1} << 62, bytes}, {0, "text"}}));
 }
 
 TEST_F(DatabaseTest, AnErrorUndoesTheWholeTransaction) {
@@ -68,8 +69,8 @@ TEST_F(DatabaseTest, ReadersSeeTheLastCommitWithoutWaiting) {
 }
 
 TEST_F(DatabaseTest, ReadersCannotWrite) {
-  const absl::Status status = database_->Read(
-      [&](Connection& c) { return c.Execute("INSERT INTO t VALUES (1, NULL)"); });
+  const absl::Status status =
+      database_->Read([&](Connection& c) { return c.Execute("INSERT INTO t VALUES (1, NULL)"); });
   EXPECT_EQ(status.code(), absl::StatusCode::kFailedPrecondition) << status;
   EXPECT_EQ(Count(), 0);
 }

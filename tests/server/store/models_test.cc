@@ -203,8 +203,8 @@ TEST_F(ModelsTest, BadNamesAreInvalid) {
   EXPECT_EQ(models.List({-1, ""}).status().code(), absl::StatusCode::kInvalidArgument);
 }
 
-// The same bytes under several models, added and deleted by several threads: the file that they share
-// must not vanish under the one that is just being added.
+// The same bytes under several models, added and deleted by several threads: the file that they
+// share must not vanish under the one that is just being added.
 TEST_F(ModelsTest, SharedFilesSurviveConcurrentDeletion) {
   constexpr int kThreads = 4;
   constexpr int kRounds = 25;

@@ -54,9 +54,8 @@ TEST(StoreOpenTest, AnotherFormatIsRefused) {
   ASSERT_TRUE(TryOpen(directory.path()).ok());
   {
     auto database = Database::Open(directory.path() + "/metaekf.db").value();
-    ASSERT_TRUE(database
-                    ->Write([](Connection& c) { return c.Execute("PRAGMA user_version = 99"); })
-                    .ok());
+    ASSERT_TRUE(
+        database->Write([](Connection& c) { return c.Execute("PRAGMA user_version = 99"); }).ok());
   }
   ExpectRefused(TryOpen(directory.path()), "has format 99, this server knows format 1");
 }
