@@ -1,0 +1,69 @@
+#include "core/plot/elements.h"
+
+#include <algorithm>
+#include <array>
+#include <cstdio>
+
+#include "absl/strings/str_cat.h"
+
+namespace metaekf::plot {
+namespace {
+
+std::string Escaped(const std::string& text) {
+  std::string escaped;
+  for (const char c : text) {
+    switch (c) {
+      case '&':
+        escaped += "&amp;";
+        break;
+      case '<':
+        escaped += "&lt;";
+        break;
+      case '>':
+        escaped += "&gt;";
+        break;
+      case '"':
+        escaped += "&quot;";
+        break;
+      default:
+        escaped += static_cast<unsigned char>(c) < 0x20 ? ' ' : c;  // illegal in XML
+    }
+  }
+  return escaped;
+}
+
+}  // namespace
+
+std::string Number(double value) {
+  char text[48];
+  std::snprintf(text, sizeof(text), "%.1f", value);
+  std::string number = text;
+  if (number.ends_with(".0")) number.resize(number.size() - 2);
+  return number == "-0" ? "0" : number;
+}
+
+void Text(double x, double y, const std::string& text, const std::string& attributes,
+          std::string& svg) {
+  absl::StrAppend(&svg, "<text x=\"", Number(x), "\" y=\"", Number(y), "\"", attributes, ">",
+                  Escaped(text), "</text>\n");
+}
+
+void Line(double x1, double y1, double x2, double y2, const char* colour, std::string& svg) {
+  absl::StrAppend(&svg, "<path d=\"M", Number(x1), " ", Number(y1), "L", Number(x2), " ",
+                  Number(y2), "\" stroke=\"", colour, "\"/>\n");
+}
+
+const char* Hex(Colour colour, size_t position) {
+  static constexpr std::array<const char*, 7> kPalette = {
+      "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#222222"};
+  if (colour == Colour::kAutomatic) return kPalette[position % 6];
+  return kPalette[static_cast<size_t>(colour) - 1];
+}
+
+double TextWidthPx(const std::string& text) {
+  // Characters, those of several bytes counted once.
+  const auto begins = [](char c) { return (static_cast<unsigned char>(c) & 0xC0) != 0x80; };
+  return 6.6 * static_cast<double>(std::count_if(text.begin(), text.end(), begins));
+}
+
+}  // namespace metaekf::plot
