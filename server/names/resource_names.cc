@@ -104,8 +104,7 @@ absl::StatusOr<Target> ParseAliasName(const std::string& field, const std::strin
   return ParseKind(Target::Kind::kAlias, field, name, "models/{model}/aliases/{alias}");
 }
 
-absl::StatusOr<std::string> ParseAdaptationName(const std::string& field,
-                                                const std::string& name) {
+absl::StatusOr<std::string> ParseAdaptationName(const std::string& field, const std::string& name) {
   const std::vector<std::string> parts = absl::StrSplit(name, '/');
   if (parts.size() != 2 || parts[0] != "adaptations") {
     return WrongForm(field, name, "adaptations/{adaptation}");

@@ -62,9 +62,8 @@ ModelCache::Loaded ModelCache::GetAdaptation(const std::string& id) {
   METAEKF_ASSIGN_OR_RETURN(const store::Adaptation adaptation, store_.adaptations().Get(id));
   const std::string name = AdaptationName(id);
   // An id may be deleted and given to another adaptation, unlike the number of a version.
-  const std::string key =
-      absl::StrCat(name, "@", adaptation.digest, "@",
-                   VersionName(adaptation.model, adaptation.version));
+  const std::string key = absl::StrCat(name, "@", adaptation.digest, "@",
+                                       VersionName(adaptation.model, adaptation.version));
   return GetOrLoad(key, [&]() -> Loaded {
     METAEKF_ASSIGN_OR_RETURN(const store::ModelVersion version,
                              store_.models().GetVersion(adaptation.model, adaptation.version));

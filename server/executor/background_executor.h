@@ -1,0 +1,45 @@
+#pragma once
+
+#include <condition_variable>
+#include <cstddef>
+#include <deque>
+#include <functional>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+namespace metaekf::server {
+
+/// A few threads that work through a bounded queue: for what must not run in a gRPC reaction, as
+/// SQL, files and computations.
+class BackgroundExecutor {
+ public:
+  struct Options {
+    size_t threads = 1;
+    size_t max_queued = 1024;
+    int nice = 0;  ///< priority of the threads; above 0 they give way to estimation
+  };
+  explicit BackgroundExecutor(const Options& options);
+  /// Runs what is queued, then ends.
+  ~BackgroundExecutor();
+
+  /// Queues `task`. False if the queue is full: shed the work (Overloaded() says so to a client).
+  [[nodiscard]] bool Submit(std::function<void()> task);
+  /// As Submit, but never refused: for the next step of something that was admitted before, of
+  /// which each call has one at most.
+  void SubmitStep(std::function<void()> task);
+
+  size_t queued() const;
+
+ private:
+  void Run(int nice);
+
+  const size_t max_queued_;
+  mutable std::mutex mutex_;
+  std::condition_variable work_ready_;
+  std::deque<std::function<void()>> queue_;
+  bool stopping_ = false;
+  std::vector<std::thread> threads_;
+};
+
+}  // namespace metaekf::server
