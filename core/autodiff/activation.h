@@ -11,7 +11,7 @@ enum class Activation : uint8_t {
   kRelu,       // max(z, 0)
   kLeakyRelu,  // z, z ≥ 0; a z, z < 0
   kElu,        // z, z ≥ 0; a (eᶻ − 1), z < 0
-  kSelu,       // λ ELU(z), the constants of Klambauer et al. (2017)
+  kSelu,       // λ ELU(z) with a = α
   kTanh,
   kSwish,     // z / (1 + e^{−z})
   kMish,      // z tanh(log(1 + eᶻ))
@@ -21,6 +21,10 @@ enum class Activation : uint8_t {
 /// The highest derivative that Apply knows: a curl-free output takes one derivative, its loss's
 /// gradient another, the Hessian–vector product a third.
 inline constexpr int kMaxDerivative = 3;
+
+/// The constants of Klambauer et al. (2017).
+inline constexpr double kSeluLambda = 1.0507009873554804934193349852946;
+inline constexpr double kSeluAlpha = 1.6732632423543772848170429916717;
 
 /// Whether σ has continuous derivatives of all orders.
 bool IsSmooth(Activation activation);
@@ -32,7 +36,7 @@ bool DerivativeIsZero(Activation activation, int order);
 double DefaultParameter(Activation activation);
 
 /// out_i = σ^(order)(z_i), i < count; in place is allowed. At the kink of a piecewise function the
-/// derivative is the right one. order must be 0 … kMaxDerivative.
+/// derivative is the right one. order must be 0 … kMaxDerivative. Vectorised for the processor at hand.
 template <typename T>
 void ApplyActivation(Activation activation, int order, T a, const T* z, T* out, size_t count);
 

@@ -44,7 +44,10 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
   spec.target_samples = positive("target_samples", spec.target_samples);
   spec.task_batch = positive("task_batch", spec.task_batch);
   spec.iterations = positive("iterations", spec.iterations);
+  spec.warmup_iterations = static_cast<int32_t>(fields.Integer("warmup_iterations", 0, 0, kMany));
+  spec.warmup_horizon = positive("warmup_horizon", spec.warmup_horizon);
   spec.outer_lr = fields.Number("outer_lr", spec.outer_lr, 0, 1e3);
+  spec.warmup_lr = fields.Number("warmup_lr", spec.outer_lr, 0, 1e3);
   spec.final_outer_lr = fields.Number("final_outer_lr", spec.outer_lr, 0, 1e3);
   spec.clip_norm = fields.Number("clip_norm", spec.clip_norm, 0, 1e12);
   spec.validation_share = fields.Number("validation_share", spec.validation_share, 0, 0.9);
@@ -69,6 +72,9 @@ json ToJson(const TrainingSpec& spec) {
           {"target_samples", spec.target_samples},
           {"task_batch", spec.task_batch},
           {"iterations", spec.iterations},
+          {"warmup_iterations", spec.warmup_iterations},
+          {"warmup_horizon", spec.warmup_horizon},
+          {"warmup_lr", spec.warmup_lr},
           {"outer_lr", spec.outer_lr},
           {"final_outer_lr", spec.final_outer_lr},
           {"clip_norm", spec.clip_norm},

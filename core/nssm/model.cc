@@ -1,5 +1,6 @@
 #include "core/nssm/model.h"
 
+#include <Eigen/QR>
 #include <cmath>
 
 #include "core/autodiff/scan.h"
@@ -47,11 +48,26 @@ int32_t Model::start_size() const {
   return spec_.is_case_one() ? spec_.window * (spec_.input_size + spec_.output_size) : spec_.state_size;
 }
 
+void Model::StartWithExactReconstruction(std::span<double> parameters) const {
+  using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+  const auto weight = [&](const std::string& name) {
+    for (const nn::Tensor& tensor : layout_.tensors()) {
+      if (tensor.name == name) return Eigen::Map<RowMajor>(parameters.data() + tensor.offset, tensor.out, tensor.in);
+    }
+    return Eigen::Map<RowMajor>(nullptr, 0, 0);
+  };
+  const Eigen::MatrixXd from_state = weight("encoder.0.weight").leftCols(spec_.state_size);
+  weight("state_decoder.0.weight") = from_state.completeOrthogonalDecomposition().pseudoInverse();
+}
+
 std::vector<double> Model::InitialParameters(uint64_t seed) const {
   std::vector<double> parameters(static_cast<size_t>(layout_.size()), 0.0);
   base::Rng rng(seed);
   for (const nn::Block* block : {&encoder_, &transition_, &transition_input_, &state_decoder_, &output_decoder_}) {
     block->Initialise(layout_, &rng, parameters);
+  }
+  if (!spec_.is_case_one() && spec_.encoder.hidden_widths.empty() && spec_.state_decoder.hidden_widths.empty()) {
+    StartWithExactReconstruction(parameters);
   }
   if (spec_.transition.bypass == Bypass::kLinear) {
     const nn::Tensor& state_bypass = layout_.tensors()[state_bypass_];

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <span>
 #include <vector>
 
 #include "absl/status/statusor.h"
@@ -32,6 +33,9 @@ class Model {
  private:
   friend class ModelGraph;
   explicit Model(const ModelSpec& spec);
+  /// Linear 𝓔 and 𝓓x: 𝓓x starts as the pseudo-inverse of 𝓔 on x, so that a rollout through the state neither dies
+  /// out nor explodes before anything is learned.
+  void StartWithExactReconstruction(std::span<double> parameters) const;
 
   ModelSpec spec_;
   nn::ParameterLayout layout_;

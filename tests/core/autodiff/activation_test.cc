@@ -5,6 +5,8 @@
 #include <cmath>
 #include <vector>
 
+#include "tests/core/autodiff/reference_activation.h"
+
 namespace metaekf::autodiff {
 namespace {
 
@@ -45,6 +47,27 @@ TEST(ActivationTest, ValuesMatchTheirDefinitions) {
     EXPECT_NEAR(Value(Activation::kMish, 0, z, 0), z * std::tanh(softplus), 1e-15);
     const double selu = z > 0 ? 1.0507009873554805 * z : 1.0507009873554805 * 1.6732632423543772 * (std::exp(z) - 1);
     EXPECT_NEAR(Value(Activation::kSelu, 0, z, 0), selu, 1e-15);
+  }
+}
+
+// Oracle: the formulas one element at a time with the standard library; its functions and Highway's differ by a few ulp.
+TEST(ActivationTest, VectorsEqualTheReferenceWhereverAnElementStands) {
+  for (const Activation activation : kAll) {
+    const double a = DefaultParameter(activation);
+    for (int order = 0; order <= kMaxDerivative; ++order) {
+      std::vector<double> z, out;
+      for (double v = -30; v < 30; v += 0.173) z.push_back(v);
+      out.resize(z.size());
+      for (const size_t count : {z.size(), z.size() - 1, z.size() - 3}) {
+        ApplyActivation(activation, order, a, z.data(), out.data(), count);
+        for (size_t i = 0; i < count; ++i) {
+          const double expected = reference::Apply(activation, order, a, z[i]);
+          EXPECT_NEAR(out[i], expected, 1e-13 * (1 + std::fabs(z[i]) + std::fabs(expected)))
+              << "activation " << static_cast<int>(activation) << " order " << order << " z " << z[i];
+          EXPECT_EQ(out[i], Value(activation, order, z[i], a));
+        }
+      }
+    }
   }
 }
 

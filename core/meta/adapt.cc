@@ -1,0 +1,183 @@
+#include "core/meta/adapt.h"
+
+#include <cmath>
+
+#include "core/base/numbers.h"
+#include "core/base/status.h"
+#include "core/data/split.h"
+#include "core/meta/adam.h"
+#include "core/meta/arx.h"
+#include "core/nssm/loss.h"
+
+namespace metaekf::meta {
+namespace {
+
+using data::Trajectory;
+using nssm::Bundle;
+using nssm::LossData;
+using nssm::LossFunction;
+using nssm::LossShape;
+
+using OnStep = std::function<bool(int32_t, int32_t, double)>;
+
+// A loss over a long context takes at most this many predicted samples at a time into memory: rollouts start further
+// apart then.
+constexpr int64_t kMaxColumns = 1 << 17;
+
+absl::Status CheckFinite(const std::string& signal, const Eigen::MatrixXd& values) {
+  for (Eigen::Index t = 0; t < values.cols(); ++t) {
+    for (Eigen::Index i = 0; i < values.rows(); ++i) {
+      if (std::isfinite(values(i, t))) continue;
+      return absl::InvalidArgumentError(absl::StrCat("context: ", signal, " ", i + 1, " of sample ", t, " is ",
+                                                     base::FormatExact(values(i, t)), "; adaptation needs every value"));
+    }
+  }
+  return absl::OkStatus();
+}
+
+struct FitResult {
+  std::vector<double> parameters;
+  double loss_before = 0, loss_after = 0;
+};
+
+absl::Status Diverged(int32_t step, double loss, double learning_rate) {
+  return absl::OutOfRangeError(absl::StrCat("the adaptation diverged: the loss is ", base::FormatShort(loss), " after ", step,
+                                            " steps with learning rate ", base::FormatShort(learning_rate),
+                                            "; a smaller learning rate may help"));
+}
+
+/// Runs the adaptation on one piece of context in normalised units.
+template <typename T>
+absl::StatusOr<FitResult> Fit(const Bundle& bundle, nssm::LossSpec loss, const Trajectory& context, const nn::Mask& mask,
+                              const AdaptationOptions& options, const OnStep& on_step) {
+  const nssm::ModelSpec& spec = bundle.model.spec();
+  METAEKF_ASSIGN_OR_RETURN(LossShape shape, nssm::ShapeOfLoss(spec, loss, context.length()));
+  const int64_t columns = int64_t{shape.rollouts} * shape.horizon;
+  if (shape.rollouts > 1 && columns > kMaxColumns) {
+    loss.stride *= static_cast<int32_t>((columns + kMaxColumns - 1) / kMaxColumns);
+    METAEKF_ASSIGN_OR_RETURN(shape, nssm::ShapeOfLoss(spec, loss, context.length()));
+  }
+  const LossFunction<T> function(bundle.model, loss, shape, mask, mask);
+  const auto scratch = function.MakeScratch();
+  const LossData<T> data = nssm::CutLossData<T>(spec, loss, context, 0, shape);
+  FitResult result;
+  result.parameters = options.method == AdaptationMethod::kFromScratch ? bundle.model.InitialParameters(options.seed)
+                                                                       : bundle.parameters;
+  nssm::RoundToPrecision(spec.precision, &result.parameters);
+  std::vector<T> typed(result.parameters.begin(), result.parameters.end()), typed_gradient(typed.size());
+  std::vector<double> gradient(typed.size()), m(typed.size(), 0), v(typed.size(), 0);
+  const int32_t steps = options.inner_loop.steps;
+  const double learning_rate = options.inner_loop.learning_rate;
+  for (int32_t step = 0; step <= steps; ++step) {
+    const double value = step < steps ? function.Gradient(typed.data(), data, typed_gradient.data(), scratch)
+                                      : function.Value(typed.data(), data, scratch);
+    if (!std::isfinite(value)) return Diverged(step, value, learning_rate);
+    (step == 0 ? result.loss_before : result.loss_after) = value;
+    if (step > 0 && on_step && !on_step(step, steps, value)) return absl::CancelledError("the adaptation was cancelled");
+    if (step == steps) break;
+    gradient.assign(typed_gradient.begin(), typed_gradient.end());
+    if (options.method == AdaptationMethod::kGradientDescent) {
+      for (size_t i = 0; i < gradient.size(); ++i) result.parameters[i] -= learning_rate * gradient[i];
+    } else {
+      AdamStep(gradient, step + 1, learning_rate, &m, &v, &result.parameters);
+    }
+    nssm::RoundToPrecision(spec.precision, &result.parameters);
+    typed.assign(result.parameters.begin(), result.parameters.end());
+  }
+  if (steps == 0) result.loss_after = result.loss_before;
+  return result;
+}
+
+absl::StatusOr<FitResult> FitAnyPrecision(const Bundle& bundle, const nssm::LossSpec& loss, const Trajectory& context,
+                                          const nn::Mask& mask, const AdaptationOptions& options,
+                                          const OnStep& on_step) {
+  METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, context));
+  return bundle.model.spec().precision == nssm::Precision::kFloat32
+             ? Fit<float>(bundle, loss, normalised, mask, options, on_step)
+             : Fit<double>(bundle, loss, normalised, mask, options, on_step);
+}
+
+absl::StatusOr<TailErrors> ErrorsOf(const Bundle& bundle, const Trajectory& tail) {
+  TailErrors errors;
+  for (const bool simulate : {false, true}) {
+    METAEKF_ASSIGN_OR_RETURN(
+        const nssm::Prediction prediction,
+        nssm::Predict(bundle, tail, simulate ? nssm::PredictionMode::kSimulate : nssm::PredictionMode::kOneStep));
+    (simulate ? errors.simulate : errors.one_step) = nssm::ScorePredictions({tail.outputs}, {prediction.outputs}).rmse;
+  }
+  return errors;
+}
+
+/// The largest order up to the default that the samples allow; the errors stay empty if none does.
+TailErrors ArxErrors(const Trajectory& head, const Trajectory& tail, int64_t warmup) {
+  TailErrors errors;
+  for (int order = ArxModel::kDefaultOrder; order >= 1; --order) {
+    const absl::StatusOr<ArxModel> arx = ArxModel::Fit(head, order);
+    if (!arx.ok() || tail.length() <= std::max<int64_t>(order, warmup)) continue;
+    errors.one_step = nssm::ScorePredictions({tail.outputs}, {arx->Predict(tail, false, warmup)}).rmse;
+    errors.simulate = nssm::ScorePredictions({tail.outputs}, {arx->Predict(tail, true, warmup)}).rmse;
+    break;
+  }
+  return errors;
+}
+
+/// Samples of the context's end that are held out.
+int64_t TailSamples(const nssm::ModelSpec& model, int64_t samples) {
+  return std::max<int64_t>(samples / 5, model.warmup() + 1);
+}
+
+}  // namespace
+
+absl::StatusOr<AdaptationOptions> DefaultAdaptation(const Bundle& bundle) {
+  const absl::StatusOr<TrainingSpec> training = ReadTrainingSpec(bundle.training);
+  if (!training.ok()) {
+    return absl::FailedPreconditionError(
+        absl::StrCat("the model does not say how it was trained: ", std::string(training.status().message())));
+  }
+  return AdaptationOptions{.inner_loop = training->adaptation};
+}
+
+int64_t ContextSamplesNeeded(const nssm::ModelSpec& model, const nssm::LossSpec& loss) {
+  return nssm::SamplesNeeded(model, loss) + model.warmup() + 1;
+}
+
+absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& context,
+                                       const AdaptationOptions& options, const OnStep& on_step) {
+  const nssm::ModelSpec& spec = bundle.model.spec();
+  METAEKF_ASSIGN_OR_RETURN(const TrainingSpec training, ReadTrainingSpec(bundle.training));
+  METAEKF_RETURN_IF_ERROR(nssm::CheckChannels(bundle, context, !spec.is_case_one()));
+  METAEKF_RETURN_IF_ERROR(CheckFinite("input", context.inputs));
+  METAEKF_RETURN_IF_ERROR(CheckFinite("output", context.outputs));
+  if (!spec.is_case_one()) METAEKF_RETURN_IF_ERROR(CheckFinite("state", context.states));
+  const int64_t needed = ContextSamplesNeeded(spec, training.loss);
+  if (context.length() < needed) {
+    return absl::FailedPreconditionError(absl::StrCat("the context is too short: ", context.length(), " samples given, ",
+                                                      needed, " needed for the model's windows"));
+  }
+  AdaptationResult result;
+  const bool from_scratch = options.method == AdaptationMethod::kFromScratch;
+  METAEKF_ASSIGN_OR_RETURN(result.mask,
+                           nn::ParseMask(from_scratch ? "*" : options.inner_loop.adapted_mask, bundle.model.layout()));
+  result.context_samples = context.length();
+  result.tail_samples = TailSamples(spec, context.length());
+  Trajectory usable = context;
+  if (spec.is_case_one()) usable.states.resize(0, context.length());
+  const Eigen::Index held_out_from = context.length() - result.tail_samples;
+  METAEKF_ASSIGN_OR_RETURN(const Trajectory head, data::FirstSamples(usable, held_out_from));
+  METAEKF_ASSIGN_OR_RETURN(const Trajectory tail, data::SamplesFrom(usable, held_out_from));
+
+  Bundle adapted = bundle;
+  METAEKF_ASSIGN_OR_RETURN(result.before, ErrorsOf(bundle, tail));
+  METAEKF_ASSIGN_OR_RETURN(FitResult trial, FitAnyPrecision(bundle, training.loss, head, result.mask, options, nullptr));
+  adapted.parameters = std::move(trial.parameters);
+  METAEKF_ASSIGN_OR_RETURN(result.after, ErrorsOf(adapted, tail));
+  result.arx = ArxErrors(head, tail, spec.warmup());
+
+  METAEKF_ASSIGN_OR_RETURN(FitResult fit, FitAnyPrecision(bundle, training.loss, usable, result.mask, options, on_step));
+  result.parameters = std::move(fit.parameters);
+  result.context_loss_before = fit.loss_before;
+  result.context_loss_after = fit.loss_after;
+  return result;
+}
+
+}  // namespace metaekf::meta

@@ -1,0 +1,63 @@
+#pragma once
+
+#include <functional>
+#include <vector>
+
+#include "absl/status/statusor.h"
+#include "core/data/trajectory.h"
+#include "core/meta/training_spec.h"
+#include "core/nssm/bundle.h"
+#include "core/nssm/predict.h"
+
+namespace metaekf::meta {
+
+enum class AdaptationMethod {
+  kGradientDescent,  ///< eq. maml_inner from the meta-learned parameters
+  kAdam,             ///< the same loss and start, Adam steps
+  kFromScratch,      ///< Adam from a random initialisation: the supervised baseline
+};
+
+struct AdaptationOptions {
+  AdaptationMethod method = AdaptationMethod::kGradientDescent;
+  InnerLoopSpec inner_loop;
+  uint64_t seed = 0;  ///< of the random initialisation
+};
+
+/// What `adapt` does with a model unless told otherwise: the inner loop that its training specification says.
+/// Errors: FailedPrecondition if the model file does not say how it was trained.
+absl::StatusOr<AdaptationOptions> DefaultAdaptation(const nssm::Bundle& bundle);
+
+/// Root mean square errors of one model on the tail of a context, per output, in its unit.
+struct TailErrors {
+  std::vector<double> one_step;
+  std::vector<double> simulate;
+};
+
+struct AdaptationResult {
+  std::vector<double> parameters;  ///< ω_M
+  nn::Mask mask;                   ///< which tensors may differ from the meta-learned ones
+  int64_t context_samples = 0;
+  double context_loss_before = 0;  ///< normalised units
+  double context_loss_after = 0;
+  int64_t tail_samples = 0;        ///< held out for the errors below
+  TailErrors before, after, arx;
+};
+
+/// Samples that an adaptation needs: enough for the loss on the head of the context and for predictions on its tail.
+int64_t ContextSamplesNeeded(const nssm::ModelSpec& model, const nssm::LossSpec& loss);
+
+/// Adapts a model to a new system (paper.tex algorithm alg:maml_inference).
+///
+/// The last fifth of the context is held out, the model adapted to the rest, and its errors on the tail noted beside
+/// those of the unadapted model and of a linear ARX model fitted to the same samples. The adaptation that is
+/// returned is then made from the whole context in the same way.
+///
+/// @param context   one trajectory in physical units.
+/// @param on_step   called with (step, steps, loss) after every step of the final adaptation; false stops it.
+/// Errors: FailedPrecondition if the context is too short, with the number needed; InvalidArgument for channels, NaN or
+/// the mask; OutOfRange if the loss diverges, saying at which step; Cancelled if on_step said so.
+absl::StatusOr<AdaptationResult> Adapt(const nssm::Bundle& bundle, const data::Trajectory& context,
+                                       const AdaptationOptions& options,
+                                       const std::function<bool(int32_t, int32_t, double)>& on_step);
+
+}  // namespace metaekf::meta

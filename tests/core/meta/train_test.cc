@@ -1,0 +1,171 @@
+#include "core/meta/train.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+
+#include "core/meta/adapt.h"
+#include "core/base/rng.h"
+#include "core/nssm/model_file.h"
+
+namespace metaekf::meta {
+namespace {
+
+using data::Dataset;
+using data::Trajectory;
+
+/// x⁺ = x + 0.1 (−a x + u), y = x with a drawn per system: what adapts is one number.
+Dataset Fleet(size_t systems, int64_t length, uint64_t seed) {
+  Dataset fleet{.input_names = {"u1"}, .output_names = {"y1"}, .state_names = {"x1"}};
+  for (size_t s = 0; s < systems; ++s) {
+    base::Rng rng(seed, s);
+    const double a = rng.Uniform(0.5, 4);
+    Trajectory t{.name = std::to_string(s), .sample_period_s = 0.1};
+    t.inputs.resize(1, length);
+    t.states.resize(1, length);
+    double x = rng.Normal();
+    for (Eigen::Index k = 0; k < length; ++k) {
+      t.inputs(0, k) = rng.Normal();
+      t.states(0, k) = x;
+      x += 0.1 * (-a * x + t.inputs(0, k));
+    }
+    t.outputs = t.states;
+    fleet.trajectories.push_back(std::move(t));
+  }
+  return fleet;
+}
+
+TrainingSpec SmallSpec() {
+  TrainingSpec spec;
+  spec.model.kind = nssm::Case::kStateInputOutput;
+  spec.model.latent_size = 3;
+  spec.model.window = 1;
+  spec.model.transition.bypass = nssm::Bypass::kSkip;
+  spec.model.transition.block.hidden_widths = {4};
+  spec.model.precision = nssm::Precision::kFloat64;
+  spec.loss = {.horizon = 5, .rollout = nssm::RolloutMode::kState, .stride = 5};
+  spec.inner_loop = spec.adaptation = {.steps = 3, .learning_rate = 0.02, .adapted_mask = "transition"};
+  spec.context_samples = spec.target_samples = 40;
+  spec.task_batch = 4;
+  spec.iterations = 30;
+  spec.warmup_iterations = 10;
+  spec.warmup_horizon = 2;
+  spec.validation_period = 10;
+  spec.outer_lr = spec.final_outer_lr = spec.warmup_lr = 0.01;
+  spec.seed = 5;
+  return spec;
+}
+
+std::string TrainedFile(const TrainingSpec& spec, size_t threads, const TrainingState* resume = nullptr) {
+  const auto executor = base::MakeThreadExecutor(threads);
+  const absl::StatusOr<nssm::Bundle> bundle = Train(spec, Fleet(10, 80, 1), resume, executor.get(), nullptr);
+  EXPECT_TRUE(bundle.ok()) << bundle.status();
+  return bundle.ok() ? nssm::WriteModelFile(*bundle) : "";
+}
+
+TEST(TrainTest, TheResultIsBitIdenticalWhateverTheNumberOfThreads) {
+  EXPECT_EQ(TrainedFile(SmallSpec(), 1), TrainedFile(SmallSpec(), 3));
+  TrainingSpec narrow = SmallSpec();
+  narrow.model.precision = nssm::Precision::kFloat32;
+  EXPECT_EQ(TrainedFile(narrow, 1), TrainedFile(narrow, 2));
+}
+
+TEST(TrainTest, AResumedTrainingEqualsAnUninterruptedOne) {
+  const TrainingSpec spec = SmallSpec();
+  const auto executor = base::MakeSerialExecutor();
+  for (const int32_t stop : {7, 10, 21}) {  // in the warm-up, at its end, behind it
+    std::string checkpoint;
+    const absl::Status status = Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), [&](const TrainingProgress& p) {
+                                  if (p.state.iteration == stop) checkpoint = WriteCheckpoint(p.state, "digest");
+                                  return p.state.iteration < stop;
+                                }).status();
+    EXPECT_EQ(status.code(), absl::StatusCode::kCancelled);
+    const absl::StatusOr<TrainingState> state = ReadCheckpoint(checkpoint, "digest");
+    ASSERT_TRUE(state.ok()) << state.status();
+    EXPECT_EQ(TrainedFile(spec, 2, &*state), TrainedFile(spec, 1)) << "stopped at " << stop;
+  }
+}
+
+TEST(TrainTest, ACheckpointOfAnotherTrainingIsRefused) {
+  const std::string checkpoint = WriteCheckpoint({.parameters = {1}, .first_moment = {0}, .second_moment = {0}, .best_parameters = {1}}, "a");
+  EXPECT_TRUE(ReadCheckpoint(checkpoint, "a").ok());
+  EXPECT_EQ(ReadCheckpoint(checkpoint, "b").status().code(), absl::StatusCode::kInvalidArgument);
+  EXPECT_FALSE(ReadCheckpoint(checkpoint.substr(0, checkpoint.size() - 3), "a").ok());
+}
+
+TEST(TrainTest, AdaptingToAnUnseenSystemBeatsTheMetaLearnedModel) {
+  TrainingSpec spec = SmallSpec();
+  spec.iterations = 500;
+  spec.warmup_iterations = 300;
+  const auto executor = base::MakeThreadExecutor(2);
+  const absl::StatusOr<nssm::Bundle> bundle = Train(spec, Fleet(20, 120, 1), nullptr, executor.get(), nullptr);
+  ASSERT_TRUE(bundle.ok()) << bundle.status();
+  const Dataset unseen = Fleet(12, 100, 77);
+  int better = 0;
+  for (const Trajectory& system : unseen.trajectories) {
+    const absl::StatusOr<AdaptationResult> result =
+        Adapt(*bundle, system, {.inner_loop = {.steps = 50, .learning_rate = 0.02, .adapted_mask = "transition"}}, nullptr);
+    ASSERT_TRUE(result.ok()) << result.status();
+    EXPECT_LT(result->context_loss_after, result->context_loss_before);
+    EXPECT_LT(result->arx.one_step[0], 1e-9);  // the system is an ARX model without noise
+    better += result->after.simulate[0] < result->before.simulate[0] ? 1 : 0;
+  }
+  EXPECT_GE(better, 10);
+}
+
+TEST(TrainTest, WhatDoesNotFitIsRefusedByName) {
+  const auto executor = base::MakeSerialExecutor();
+  const auto message = [&](const TrainingSpec& spec, const Dataset& fleet) {
+    return std::string(Train(spec, fleet, nullptr, executor.get(), nullptr).status().message());
+  };
+  Dataset fleet = Fleet(5, 80, 1);
+  TrainingSpec spec = SmallSpec();
+  spec.target_samples = 81;
+  EXPECT_NE(message(spec, fleet).find("trajectory 0: 80 samples"), std::string::npos);
+  spec = SmallSpec();
+  spec.model.output_size = 2;
+  EXPECT_NE(message(spec, fleet).find("model.output_size is 2, the data has 1"), std::string::npos);
+  spec = SmallSpec();
+  spec.inner_loop.adapted_mask = "enconder";
+  EXPECT_NE(message(spec, fleet).find("\"enconder\" matches no parameter"), std::string::npos);
+  spec = SmallSpec();
+  spec.inner_loop = {.steps = 100, .learning_rate = 1e6};
+  spec.warmup_iterations = 0;
+  EXPECT_NE(message(spec, fleet).find("diverged at iteration"), std::string::npos);
+  fleet.trajectories[3].sample_period_s = 0.2;
+  EXPECT_NE(message(SmallSpec(), fleet).find("trajectory 3"), std::string::npos);
+  fleet.state_names.clear();
+  EXPECT_NE(message(SmallSpec(), fleet).find("state columns"), std::string::npos);
+}
+
+TEST(AdaptTest, AContextTooShortIsRefusedWithTheNumberNeeded) {
+  const auto executor = base::MakeSerialExecutor();
+  const nssm::Bundle bundle = *Train(SmallSpec(), Fleet(10, 80, 1), nullptr, executor.get(), nullptr);
+  const Trajectory system = Fleet(1, 7, 3).trajectories[0];
+  const absl::Status status = Adapt(bundle, system, {.inner_loop = {.steps = 1}}, nullptr).status();
+  EXPECT_EQ(status.code(), absl::StatusCode::kFailedPrecondition);
+  EXPECT_NE(std::string(status.message()).find("7 samples given, 8 needed"), std::string::npos) << status;
+  EXPECT_TRUE(Adapt(bundle, Fleet(1, 8, 3).trajectories[0], {.inner_loop = {.steps = 1}}, nullptr).ok());
+  Trajectory with_nan = Fleet(1, 60, 3).trajectories[0];
+  with_nan.outputs(0, 9) = std::nan("");
+  EXPECT_NE(std::string(Adapt(bundle, with_nan, {}, nullptr).status().message()).find("sample 9"), std::string::npos);
+}
+
+TEST(AdaptTest, ZeroStepsLeaveTheModelAndFullyFrozenTensorsStay) {
+  const auto executor = base::MakeSerialExecutor();
+  const nssm::Bundle bundle = *Train(SmallSpec(), Fleet(10, 80, 1), nullptr, executor.get(), nullptr);
+  const Trajectory system = Fleet(1, 60, 3).trajectories[0];
+  EXPECT_EQ(Adapt(bundle, system, {.inner_loop = {.steps = 0}}, nullptr)->parameters, bundle.parameters);
+  const AdaptationResult result =
+      *Adapt(bundle, system, {.inner_loop = {.steps = 4, .learning_rate = 0.01, .adapted_mask = "transition.1"}}, nullptr);
+  for (const nn::Tensor& tensor : bundle.model.layout().tensors()) {
+    const bool adapts = tensor.name.rfind("transition.1", 0) == 0;
+    const bool equal = std::equal(bundle.parameters.begin() + tensor.offset,
+                                  bundle.parameters.begin() + tensor.offset + tensor.size(),
+                                  result.parameters.begin() + tensor.offset);
+    EXPECT_EQ(equal, !adapts) << tensor.name;
+  }
+}
+
+}  // namespace
+}  // namespace metaekf::meta

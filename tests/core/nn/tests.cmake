@@ -1,0 +1,1 @@
+metaekf_test(core/nn/parameters_test.cc DEPS metaekf::core_nn)

@@ -1,0 +1,116 @@
+#include "core/nssm/model_file.h"
+
+#include <gtest/gtest.h>
+
+#include <cstring>
+
+#include "core/nssm/safetensors.h"
+#include "tests/core/nssm/random_models.h"
+#include "tests/support/bundles.h"
+
+namespace metaekf::nssm {
+namespace {
+
+Bundle SomeBundle(const ModelCase& c) {
+  Bundle bundle = support::UnitBundle(*Model::Create(c.model));
+  bundle.parameters = RandomParameters(bundle.model, 3);
+  RoundToPrecision(c.model.precision, &bundle.parameters);
+  bundle.normaliser.outputs.mean.setConstant(0.1);
+  bundle.training = {{"seed", 3}};
+  return bundle;
+}
+
+TEST(ModelFileTest, EveryKindOfModelReadsBackExactly) {
+  for (ModelCase c : ModelCases()) {
+    for (const Precision precision : {Precision::kFloat32, Precision::kFloat64}) {
+      c.model.precision = precision;
+      const Bundle bundle = SomeBundle(c);
+      const std::string bytes = WriteModelFile(bundle);
+      const absl::StatusOr<Bundle> back = ReadModelFile(bytes);
+      ASSERT_TRUE(back.ok()) << c.name << ": " << back.status();
+      EXPECT_EQ(back->parameters, bundle.parameters);
+      EXPECT_EQ(back->normaliser.outputs.mean, bundle.normaliser.outputs.mean);
+      EXPECT_EQ(back->noise.process, bundle.noise.process);
+      EXPECT_EQ(back->training, bundle.training);
+      EXPECT_EQ(WriteModelFile(*back), bytes);
+    }
+  }
+}
+
+TEST(ModelFileTest, AnAdaptedSubsetGoesOverItsBase) {
+  const Bundle base = SomeBundle(ModelCases().front());
+  Bundle adapted = base;
+  for (double& value : adapted.parameters) value += 1;
+  const nn::Mask mask = *nn::ParseMask("output_decoder", base.model.layout());
+  const std::string subset = WriteAdaptedSubset(adapted, mask);
+  EXPECT_LT(subset.size(), WriteModelFile(base).size() / 2);
+  Bundle restored = base;
+  ASSERT_TRUE(ApplyAdaptedSubset(subset, &restored).ok());
+  for (size_t i = 0; i < mask.size(); ++i) {
+    const nn::Tensor& tensor = base.model.layout().tensors()[i];
+    for (size_t k = static_cast<size_t>(tensor.offset); k < static_cast<size_t>(tensor.offset + tensor.size()); ++k) {
+      EXPECT_EQ(restored.parameters[k], mask[i] ? adapted.parameters[k] : base.parameters[k]) << tensor.name;
+    }
+  }
+}
+
+TEST(ModelFileTest, WhatIsMissingOrDamagedIsNamed) {
+  const Bundle bundle = SomeBundle(ModelCases().front());
+  const auto message_without = [&](auto change) {
+    Safetensors file = *ReadSafetensors(WriteModelFile(bundle));
+    change(&file);
+    return std::string(ReadModelFile(WriteSafetensors(file)).status().message());
+  };
+  EXPECT_NE(message_without([](Safetensors* f) { f->tensors.pop_back(); }).find("is missing"), std::string::npos);
+  EXPECT_NE(message_without([](Safetensors* f) { f->tensors[0].name = "other"; }).find("\"other\" is not part"), std::string::npos);
+  EXPECT_NE(message_without([](Safetensors* f) { f->tensors[0].values[0] = std::nan(""); }).find("value 0 is not finite"), std::string::npos);
+  EXPECT_NE(message_without([](Safetensors* f) { f->metadata.clear(); }).find("no \"metaekf\" metadata"), std::string::npos);
+  const auto with_metadata = [&](const std::string& from, const std::string& to) {
+    return message_without([&](Safetensors* f) {
+      std::string& text = f->metadata["metaekf"];
+      const size_t at = text.find(from);
+      ASSERT_NE(at, std::string::npos) << from;
+      text.replace(at, from.size(), to);
+    });
+  };
+  EXPECT_NE(with_metadata("\"format_version\":1", "\"format_version\":2").find("format version 2"), std::string::npos);
+  EXPECT_NE(with_metadata("\"hidden_widths\":[4]", "\"hidden_widths\":[5]").find("\"encoder.0.weight\" has not the shape"), std::string::npos);
+  EXPECT_NE(with_metadata("\"measurement_cov\":[[1.0", "\"measurement_cov\":[[-1.0").find("measurement_cov"), std::string::npos);
+}
+
+std::string Container(const std::string& header, size_t data_bytes) {
+  std::string bytes(8, '\0');
+  const uint64_t size = header.size();
+  std::memcpy(bytes.data(), &size, 8);
+  return bytes + header + std::string(data_bytes, '\0');
+}
+
+TEST(SafetensorsTest, HostileFilesAreRefused) {
+  const std::string tensor = R"("a":{"dtype":"F32","shape":[2],"data_offsets":[0,8]})";
+  EXPECT_TRUE(ReadSafetensors(Container("{" + tensor + "}", 8)).ok());
+  const std::string bad[] = {
+      "",
+      "1234567",
+      std::string(8, '\xff'),
+      Container("{" + tensor + "}", 7),
+      Container("{" + tensor + "}", 9),
+      Container("{" + tensor + "," + tensor + "}", 8),
+      Container("[1]", 0),
+      Container("{", 0),
+      Container(R"({"a":{"dtype":"I64","shape":[1],"data_offsets":[0,8]}})", 8),
+      Container(R"({"a":{"dtype":"F32","shape":[-2],"data_offsets":[0,8]}})", 8),
+      Container(R"({"a":{"dtype":"F32","shape":[4611686018427387904,4],"data_offsets":[0,0]}})", 0),
+      Container(R"({"a":{"dtype":"F32","shape":[1099511627776,1099511627776],"data_offsets":[0,0]}})", 0),
+      Container(R"({"a":{"dtype":"F32","shape":[2],"data_offsets":[8,0]}})", 8),
+      Container(R"({"a":{"dtype":"F32","shape":[2],"data_offsets":[4,12]}})", 12),
+      Container(R"({"a":{"dtype":"F32","shape":[2],"data_offsets":[0,8]},"b":{"dtype":"F32","shape":[2],"data_offsets":[4,12]}})", 12),
+      Container(R"({"a":{"dtype":"F32","shape":[0],"data_offsets":[0,0]}})", 0),
+      Container(R"({"__metadata__":{"k":3}})", 0),
+  };
+  for (const std::string& bytes : bad) {
+    EXPECT_EQ(ReadSafetensors(bytes).status().code(), absl::StatusCode::kInvalidArgument) << bytes;
+  }
+}
+
+}  // namespace
+}  // namespace metaekf::nssm
