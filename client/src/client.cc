@@ -1,0 +1,90 @@
+#include <cmath>
+
+#include "client/src/impl.h"
+#include "client/src/text_proto.h"
+
+namespace metaekf::client {
+namespace {
+
+grpc::ChannelArguments Arguments() {
+  grpc::ChannelArguments arguments;
+  arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, 100);
+  // Finds half-open connections; servers end clients that ping more often than every 10 s.
+  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, 25'000);
+  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, 10'000);
+  arguments.SetInt(GRPC_ARG_HTTP2_MAX_PINGS_WITHOUT_DATA, 0);
+  // A server on this machine or network is not behind the proxy that the environment may name.
+  arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
+  arguments.SetMaxReceiveMessageSize(16 << 20);
+  return arguments;
+}
+
+}  // namespace
+
+Client::Impl::Impl(const Options& client_options)
+    : options(client_options),
+      channel(grpc::CreateCustomChannel(options.server, grpc::InsecureChannelCredentials(),
+                                        Arguments())),
+      server(v1::ServerService::NewStub(channel)),
+      models(v1::ModelService::NewStub(channel)),
+      training(v1::TrainingService::NewStub(channel)),
+      adaptations(v1::AdaptationService::NewStub(channel)),
+      predictions(v1::PredictionService::NewStub(channel)),
+      estimation(v1::EstimationService::NewStub(channel)) {}
+
+Status Client::Impl::Translate(const grpc::Status& status) const {
+  Status result = FromGrpc(status);
+  if (result.code == Code::kUnavailable && status.error_details().empty()) {
+    // Errors of gRPC itself, not of the server.
+    const bool unresolved = result.message.find("resolution failed") != std::string::npos;
+    const bool never_connected = channel->GetState(false) == GRPC_CHANNEL_TRANSIENT_FAILURE ||
+                                 result.message.find("failed to connect") != std::string::npos;
+    if (unresolved || never_connected) {
+      result.reason = "NO_SERVER";
+      result.message = "no server at " + options.server +
+                       (unresolved ? ", an address that cannot be resolved" : "");
+    } else {
+      result.reason = "CONNECTION_LOST";
+      result.message = "the connection to " + options.server + " was lost (" + result.message + ")";
+    }
+    result.metadata["server"] = options.server;
+  }
+  if (result.code == Code::kDeadlineExceeded) {
+    result.message = options.server + " did not answer within " +
+                     std::to_string(std::lround(options.timeout_s)) + " s";
+  }
+  if (result.code == Code::kUnimplemented) {
+    result.message = "what answers at " + options.server +
+                     " is no metaekf server, or one of another version (" + result.message + ")";
+  }
+  return result;
+}
+
+void Client::Impl::SetDeadline(grpc::ClientContext& context) const {
+  context.set_deadline(std::chrono::system_clock::now() +
+                       std::chrono::microseconds(std::llround(1e6 * options.timeout_s)));
+}
+
+Client::Client(const Options& options) : impl_(std::make_shared<Impl>(options)) {}
+Client::~Client() = default;
+Client::Client(Client&&) noexcept = default;
+Client& Client::operator=(Client&&) noexcept = default;
+
+const std::string& Client::server() const { return impl_->options.server; }
+
+Result<ServerInfo> Client::GetServerInfo(bool verify_files) {
+  v1::GetServerInfoRequest request;
+  request.set_verify_files(verify_files);
+  v1::ServerInfo response;
+  METAEKF_CLIENT_RETURN_IF_ERROR(
+      impl_->Call(impl_->server, &v1::ServerService::Stub::GetServerInfo, request, &response));
+  return FromProto(response);
+}
+
+Result<NoiseSettings> ParseNoiseSettings(const std::string& text, const std::string& source) {
+  v1::NoiseSettings message;
+  METAEKF_CLIENT_RETURN_IF_ERROR(ParseText(text, source, &message));
+  return FromProto(message);
+}
+
+}  // namespace metaekf::client
