@@ -153,6 +153,10 @@ absl::Status Ekf::Step(const Ref<const VectorXd>& input, const Ref<const VectorX
   return absl::OkStatus();
 }
 
+VectorXd Ekf::LastInput() const {
+  return state_.last_input.cwiseProduct(normaliser_.inputs.scale) + normaliser_.inputs.mean;
+}
+
 void Ekf::FillWindow(FilterModel::Scratch* scratch) {
   // The encoder has no place for a value that was not measured: the window starts anew behind it.
   if (y_.hasNaN()) {

@@ -78,6 +78,9 @@ class Ekf {
   /// Goes on from a state of a filter of the same model and options.
   void Restore(FilterState state) { state_ = std::move(state); }
 
+  /// u of the last sample, physical units; the inputs' means before the first.
+  Eigen::VectorXd LastInput() const;
+
   int32_t estimate_size() const { return case_one_ ? output_size_ : state_size_; }
   int32_t input_size() const { return input_size_; }
   int32_t output_size() const { return output_size_; }

@@ -24,6 +24,10 @@ using OnStep = std::function<bool(int32_t, int32_t, double)>;
 // apart then.
 constexpr int64_t kMaxColumns = 1 << 17;
 
+constexpr int32_t kScratchSteps = 10;  // times those of an adaptation, as the paper allows its baseline
+constexpr double kScratchLearningRate = 3e-3;
+constexpr double kAdamLearningRate = 1e-3;
+
 absl::Status CheckFinite(const std::string& signal, const Eigen::MatrixXd& values) {
   for (Eigen::Index t = 0; t < values.cols(); ++t) {
     for (Eigen::Index i = 0; i < values.rows(); ++i) {
@@ -128,13 +132,27 @@ int64_t TailSamples(const nssm::ModelSpec& model, int64_t samples) {
 
 }  // namespace
 
-absl::StatusOr<AdaptationOptions> DefaultAdaptation(const Bundle& bundle) {
+absl::StatusOr<AdaptationOptions> DefaultAdaptation(const Bundle& bundle, std::optional<AdaptationMethod> method) {
   const absl::StatusOr<TrainingSpec> training = ReadTrainingSpec(bundle.training);
   if (!training.ok()) {
     return absl::FailedPreconditionError(
         absl::StrCat("the model does not say how it was trained: ", std::string(training.status().message())));
   }
-  return AdaptationOptions{.inner_loop = training->adaptation};
+  AdaptationOptions options{.inner_loop = training->adaptation};
+  const AdaptationMethod trained_for = options.inner_loop.optimiser == Optimiser::kAdam
+                                           ? AdaptationMethod::kAdam
+                                           : AdaptationMethod::kGradientDescent;
+  options.method = method.value_or(trained_for);
+  if (options.method == AdaptationMethod::kFromScratch) {
+    options.inner_loop.steps *= kScratchSteps;
+    options.inner_loop.learning_rate = kScratchLearningRate;
+    options.inner_loop.adapted_mask = "*";
+  } else if (options.method == AdaptationMethod::kAdam && trained_for != AdaptationMethod::kAdam) {
+    options.inner_loop.learning_rate = kAdamLearningRate;
+  } else if (options.method == AdaptationMethod::kGradientDescent && trained_for == AdaptationMethod::kAdam) {
+    options.inner_loop.learning_rate = training->inner_loop.learning_rate;
+  }
+  return options;
 }
 
 int64_t ContextSamplesNeeded(const nssm::ModelSpec& model, const nssm::LossSpec& loss) {
@@ -155,9 +173,7 @@ absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& c
                                                       needed, " needed for the model's windows"));
   }
   AdaptationResult result;
-  const bool from_scratch = options.method == AdaptationMethod::kFromScratch;
-  METAEKF_ASSIGN_OR_RETURN(result.mask,
-                           nn::ParseMask(from_scratch ? "*" : options.inner_loop.adapted_mask, bundle.model.layout()));
+  METAEKF_ASSIGN_OR_RETURN(result.mask, nn::ParseMask(options.inner_loop.adapted_mask, bundle.model.layout()));
   result.context_samples = context.length();
   result.tail_samples = TailSamples(spec, context.length());
   Trajectory usable = context;

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <functional>
+#include <optional>
 #include <vector>
 
 #include "absl/status/statusor.h"
@@ -23,9 +24,11 @@ struct AdaptationOptions {
   uint64_t seed = 0;  ///< of the random initialisation
 };
 
-/// What `adapt` does with a model unless told otherwise: the inner loop that its training specification says.
+/// What `adapt` does with a model unless told otherwise. Without a method: what its training specification says. The
+/// baseline from scratch is given all parameters and ten times the steps.
 /// Errors: FailedPrecondition if the model file does not say how it was trained.
-absl::StatusOr<AdaptationOptions> DefaultAdaptation(const nssm::Bundle& bundle);
+absl::StatusOr<AdaptationOptions> DefaultAdaptation(const nssm::Bundle& bundle,
+                                                    std::optional<AdaptationMethod> method = std::nullopt);
 
 /// Root mean square errors of one model on the tail of a context, per output, in its unit.
 struct TailErrors {

@@ -245,7 +245,8 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(const Bundle& bundle, con
     const int64_t samples = std::min<int64_t>(
         system.length(), std::max<int64_t>(spec.context_samples, ContextSamplesNeeded(spec.model, spec.loss)));
     METAEKF_ASSIGN_OR_RETURN(const Trajectory context, data::FirstSamples(system, samples));
-    const absl::StatusOr<AdaptationResult> adapted = Adapt(bundle, context, {.inner_loop = spec.adaptation}, nullptr);
+    METAEKF_ASSIGN_OR_RETURN(const AdaptationOptions options, DefaultAdaptation(bundle));
+    const absl::StatusOr<AdaptationResult> adapted = Adapt(bundle, context, options, nullptr);
     // An adaptation that diverges says nothing about noise; the unadapted model stands in.
     noise.Add(adapted.ok() ? adapted->parameters : bundle.parameters, normalised);
   }

@@ -11,19 +11,34 @@ using nlohmann::json;
 const std::vector<std::pair<std::string, Algorithm>> kAlgorithms = {
     {"MAML", Algorithm::kMaml}, {"FIRST_ORDER_MAML", Algorithm::kFirstOrderMaml}, {"SUPERVISED", Algorithm::kSupervised}};
 
+const std::vector<std::pair<std::string, Optimiser>> kOptimisers = {{"GRADIENT_DESCENT", Optimiser::kGradientDescent},
+                                                                    {"ADAM", Optimiser::kAdam}};
+
 constexpr int32_t kMany = 100'000'000;
+
+template <typename Enum>
+std::string NameOf(const std::vector<std::pair<std::string, Enum>>& names, Enum value) {
+  for (const auto& [name, candidate] : names) {
+    if (candidate == value) return name;
+  }
+  return "";
+}
 
 InnerLoopSpec ReadInnerLoop(JsonFields* parent, const std::string& name, InnerLoopSpec spec) {
   JsonFields fields = parent->Object(name);
   spec.steps = static_cast<int32_t>(fields.Integer("steps", spec.steps, 0, 1'000'000));
   spec.learning_rate = fields.Number("learning_rate", spec.learning_rate, 0, 1e6);
   spec.adapted_mask = fields.String("adapted_mask", spec.adapted_mask);
+  spec.optimiser = fields.Choice("optimiser", spec.optimiser, kOptimisers);
   parent->Include(fields.Finish());
   return spec;
 }
 
 json InnerLoopJson(const InnerLoopSpec& spec) {
-  return {{"steps", spec.steps}, {"learning_rate", spec.learning_rate}, {"adapted_mask", spec.adapted_mask}};
+  return {{"steps", spec.steps},
+          {"learning_rate", spec.learning_rate},
+          {"adapted_mask", spec.adapted_mask},
+          {"optimiser", NameOf(kOptimisers, spec.optimiser)}};
 }
 
 }  // namespace
@@ -35,6 +50,9 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
   METAEKF_ASSIGN_OR_RETURN(spec.loss, nssm::ReadLossSpec(fields.Object("loss"), spec.model));
   spec.algorithm = fields.Choice("algorithm", Algorithm::kMaml, kAlgorithms);
   spec.inner_loop = ReadInnerLoop(&fields, "inner_loop", InnerLoopSpec());
+  if (spec.inner_loop.optimiser == Optimiser::kAdam) {
+    fields.Fail("inner_loop.optimiser", "the inner loop of training is gradient descent; ADAM is for adaptation");
+  }
   spec.adaptation = ReadInnerLoop(&fields, "adaptation", spec.inner_loop);
   const auto positive = [&fields](const std::string& name, int32_t default_value) {
     const int32_t value = static_cast<int32_t>(fields.Integer(name, default_value, 0, kMany));
@@ -59,13 +77,9 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
 }
 
 json ToJson(const TrainingSpec& spec) {
-  std::string algorithm;
-  for (const auto& [name, value] : kAlgorithms) {
-    if (value == spec.algorithm) algorithm = name;
-  }
   return {{"model", nssm::ToJson(spec.model)},
           {"loss", nssm::ToJson(spec.loss)},
-          {"algorithm", algorithm},
+          {"algorithm", NameOf(kAlgorithms, spec.algorithm)},
           {"inner_loop", InnerLoopJson(spec.inner_loop)},
           {"adaptation", InnerLoopJson(spec.adaptation)},
           {"context_samples", spec.context_samples},

@@ -10,11 +10,14 @@ namespace metaekf::meta {
 
 enum class Algorithm { kMaml, kFirstOrderMaml, kSupervised };
 
+enum class Optimiser { kGradientDescent, kAdam };
+
 /// The inner loop, in training or at adaptation: the message InnerLoopSpec of spec.proto.
 struct InnerLoopSpec {
   int32_t steps = 10;
   double learning_rate = 0.01;
   std::string adapted_mask = "*";
+  Optimiser optimiser = Optimiser::kGradientDescent;  ///< kAdam at adaptation only
 };
 
 /// How a model is meta-trained: the message TrainingSpec of spec.proto, where each field is described.
