@@ -33,14 +33,6 @@ bool BackgroundExecutor::Submit(std::function<void()> task) {
   return true;
 }
 
-void BackgroundExecutor::SubmitStep(std::function<void()> task) {
-  {
-    std::lock_guard lock(mutex_);
-    queue_.push_back(std::move(task));
-  }
-  work_ready_.notify_one();
-}
-
 size_t BackgroundExecutor::queued() const {
   std::lock_guard lock(mutex_);
   return queue_.size();

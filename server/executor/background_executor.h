@@ -23,12 +23,8 @@ class BackgroundExecutor {
   /// Runs what is queued, then ends.
   ~BackgroundExecutor();
 
-  /// Queues `task`. False if the queue is full: shed the work (Overloaded() says so to a client).
+  /// Queues `task`. False if the queue is full: shed the work.
   [[nodiscard]] bool Submit(std::function<void()> task);
-  /// As Submit, but never refused: for the next step of something that was admitted before, of
-  /// which each call has one at most.
-  void SubmitStep(std::function<void()> task);
-
   size_t queued() const;
 
  private:

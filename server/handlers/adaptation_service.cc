@@ -1,0 +1,47 @@
+#include "metaekf/v1/adaptation.grpc.pb.h"
+#include "server/handlers/adaptation_handlers.h"
+#include "server/handlers/bidi_call.h"
+#include "server/handlers/services.h"
+#include "server/handlers/unary_call.h"
+
+namespace metaekf::server {
+namespace {
+
+using grpc::CallbackServerContext;
+using grpc::ServerUnaryReactor;
+
+class AdaptationService final : public v1::AdaptationService::CallbackService {
+ public:
+  explicit AdaptationService(const ServiceContext& context) : context_(context) {}
+
+  grpc::ServerBidiReactor<v1::AdaptRequest, v1::AdaptResponse>* Adapt(
+      CallbackServerContext* call) override {
+    return new BidiCall(call, server::Adapt(context_), context_.io, context_.compute);
+  }
+  ServerUnaryReactor* GetAdaptation(CallbackServerContext* call,
+                                    const v1::GetAdaptationRequest* request,
+                                    v1::Adaptation* response) override {
+    return RunUnary(call, context_.io, server::GetAdaptation, context_, request, response);
+  }
+  ServerUnaryReactor* ListAdaptations(CallbackServerContext* call,
+                                      const v1::ListAdaptationsRequest* request,
+                                      v1::ListAdaptationsResponse* response) override {
+    return RunUnary(call, context_.io, server::ListAdaptations, context_, request, response);
+  }
+  ServerUnaryReactor* DeleteAdaptation(CallbackServerContext* call,
+                                       const v1::DeleteAdaptationRequest* request,
+                                       google::protobuf::Empty* response) override {
+    return RunUnary(call, context_.io, server::DeleteAdaptation, context_, request, response);
+  }
+
+ private:
+  const ServiceContext& context_;
+};
+
+}  // namespace
+
+std::unique_ptr<grpc::Service> MakeAdaptationService(const ServiceContext& context) {
+  return std::make_unique<AdaptationService>(context);
+}
+
+}  // namespace metaekf::server

@@ -1,0 +1,135 @@
+#pragma once
+
+#include <grpcpp/server_context.h>
+#include <grpcpp/support/server_callback.h>
+
+#include <atomic>
+#include <deque>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <utility>
+
+#include "server/executor/background_executor.h"
+#include "server/handlers/overload.h"
+#include "server/handlers/stream_handler.h"
+#include "server/status/grpc_status.h"
+
+namespace metaekf::server {
+
+/// Runs a StreamHandler on a bidirectional call. Owns itself until the call is done.
+///
+/// One thing after the other: read, handle on an executor, write what the handler sent (which may
+/// begin while it still runs), read again. So a client that does not read is not read from either.
+template <class Request, class Response>
+class BidiCall final : public grpc::ServerBidiReactor<Request, Response>,
+                       private ResponseSink<Response> {
+ public:
+  /// @param at_request, at_end  where the handler's two functions run.
+  BidiCall(grpc::CallbackServerContext* context,
+           std::unique_ptr<StreamHandler<Request, Response>> handler,
+           BackgroundExecutor& at_request, BackgroundExecutor& at_end)
+      : context_(context), handler_(std::move(handler)), at_request_(at_request), at_end_(at_end) {
+    this->StartRead(&request_);
+  }
+
+  void OnReadDone(bool ok) override {
+    BackgroundExecutor& executor = ok ? at_request_ : at_end_;
+    if (!executor.Submit([this, ok] { Handle(ok); })) EndStep(Overloaded(), true);
+  }
+
+  void OnWriteDone(bool ok) override {
+    {
+      std::lock_guard lock(mutex_);
+      writing_ = false;
+      outbox_.pop_front();
+      if (!ok) outbox_.clear();
+    }
+    Advance();
+  }
+
+  void OnCancel() override { cancelled_ = true; }
+  void OnDone() override { delete this; }
+
+ private:
+  enum class Action { kNone, kRead, kWrite, kFinish };
+
+  void Handle(bool is_request) {
+    if (cancelled()) return EndStep(absl::CancelledError("the call was cancelled"), true);
+    if (is_request) {
+      const absl::Status status = handler_->OnRequest(request_, *this);
+      EndStep(status, !status.ok());
+    } else {
+      EndStep(handler_->OnEnd(*this), true);
+    }
+  }
+
+  void EndStep(const absl::Status& status, bool last) {
+    {
+      std::lock_guard lock(mutex_);
+      step_done_ = true;
+      if (last) result_ = status;
+    }
+    Advance();
+  }
+
+  void Send(Response response) override {
+    {
+      std::lock_guard lock(mutex_);
+      outbox_.push_back(std::move(response));
+    }
+    Advance();
+  }
+
+  bool idle() override {
+    std::lock_guard lock(mutex_);
+    return outbox_.empty();
+  }
+
+  bool cancelled() override { return cancelled_ || context_->IsCancelled(); }
+
+  /// @param message  what kWrite is to write.
+  Action NextAction(const Response** message) {
+    std::lock_guard lock(mutex_);
+    if (writing_) return Action::kNone;
+    if (cancelled_) outbox_.clear();
+    if (!outbox_.empty()) {
+      writing_ = true;
+      *message = &outbox_.front();
+      return Action::kWrite;
+    }
+    if (!step_done_) return Action::kNone;
+    step_done_ = false;
+    return result_ ? Action::kFinish : Action::kRead;
+  }
+
+  /// Starts what comes next, outside the lock: once Finish is called, this may be deleted.
+  void Advance() {
+    const Response* message = nullptr;
+    switch (NextAction(&message)) {
+      case Action::kNone:
+        return;
+      case Action::kRead:
+        return this->StartRead(&request_);
+      case Action::kWrite:
+        return this->StartWrite(message);
+      case Action::kFinish:
+        return this->Finish(ToGrpcStatus(*result_));
+    }
+  }
+
+  grpc::CallbackServerContext* const context_;
+  const std::unique_ptr<StreamHandler<Request, Response>> handler_;
+  BackgroundExecutor& at_request_;
+  BackgroundExecutor& at_end_;
+  Request request_;
+  std::atomic<bool> cancelled_ = false;
+
+  std::mutex mutex_;
+  std::deque<Response> outbox_;  // its front is being written
+  bool writing_ = false;
+  bool step_done_ = false;  // the handler has returned, what comes next has not begun
+  std::optional<absl::Status> result_;
+};
+
+}  // namespace metaekf::server

@@ -1,0 +1,71 @@
+#include "metaekf/v1/model.grpc.pb.h"
+#include "server/handlers/download_call.h"
+#include "server/handlers/model_handlers.h"
+#include "server/handlers/services.h"
+#include "server/handlers/unary_call.h"
+#include "server/handlers/upload_call.h"
+
+namespace metaekf::server {
+namespace {
+
+using grpc::CallbackServerContext;
+using grpc::ServerUnaryReactor;
+
+class ModelService final : public v1::ModelService::CallbackService {
+ public:
+  explicit ModelService(const ServiceContext& context) : context_(context) {}
+
+  ServerUnaryReactor* ListModels(CallbackServerContext* call, const v1::ListModelsRequest* request,
+                                 v1::ListModelsResponse* response) override {
+    return RunUnary(call, context_.io, server::ListModels, context_, request, response);
+  }
+  ServerUnaryReactor* GetModel(CallbackServerContext* call, const v1::GetModelRequest* request,
+                               v1::Model* response) override {
+    return RunUnary(call, context_.io, server::GetModel, context_, request, response);
+  }
+  ServerUnaryReactor* ListModelVersions(CallbackServerContext* call,
+                                        const v1::ListModelVersionsRequest* request,
+                                        v1::ListModelVersionsResponse* response) override {
+    return RunUnary(call, context_.io, server::ListModelVersions, context_, request, response);
+  }
+  ServerUnaryReactor* GetModelVersion(CallbackServerContext* call,
+                                      const v1::GetModelVersionRequest* request,
+                                      v1::ModelVersion* response) override {
+    return RunUnary(call, context_.io, server::GetModelVersion, context_, request, response);
+  }
+  ServerUnaryReactor* SetModelAlias(CallbackServerContext* call,
+                                    const v1::SetModelAliasRequest* request,
+                                    v1::ModelAlias* response) override {
+    return RunUnary(call, context_.io, server::SetModelAlias, context_, request, response);
+  }
+  ServerUnaryReactor* DeleteModelAlias(CallbackServerContext* call,
+                                       const v1::DeleteModelAliasRequest* request,
+                                       Empty* response) override {
+    return RunUnary(call, context_.io, server::DeleteModelAlias, context_, request, response);
+  }
+  ServerUnaryReactor* DeleteModelVersion(CallbackServerContext* call,
+                                         const v1::DeleteModelVersionRequest* request,
+                                         Empty* response) override {
+    return RunUnary(call, context_.io, server::DeleteModelVersion, context_, request, response);
+  }
+
+  grpc::ServerReadReactor<v1::ImportModelVersionRequest>* ImportModelVersion(
+      CallbackServerContext* call, v1::ModelVersion* response) override {
+    return new UploadCall(call, server::ImportModelVersion(context_), context_.io, response);
+  }
+  grpc::ServerWriteReactor<v1::ExportModelVersionResponse>* ExportModelVersion(
+      CallbackServerContext*, const v1::ExportModelVersionRequest* request) override {
+    return new DownloadCall(server::ExportModelVersion(context_, *request), context_.io);
+  }
+
+ private:
+  const ServiceContext& context_;
+};
+
+}  // namespace
+
+std::unique_ptr<grpc::Service> MakeModelService(const ServiceContext& context) {
+  return std::make_unique<ModelService>(context);
+}
+
+}  // namespace metaekf::server

@@ -1,0 +1,114 @@
+#include "core/nssm/predict.h"
+
+#include <algorithm>
+#include <optional>
+#include <utility>
+
+#include "absl/strings/str_cat.h"
+#include "core/base/status.h"
+#include "server/convert/samples.h"
+#include "server/handlers/prediction_handlers.h"
+#include "server/status/details.h"
+
+namespace metaekf::server {
+namespace {
+
+using Request = v1::PredictRequest;
+using Response = v1::PredictResponse;
+using Sink = ResponseSink<Response>;
+
+constexpr Eigen::Index kValuesPerResponse = 16'384;
+
+void Append(const Eigen::MatrixXd& values, Eigen::Index first, Eigen::Index count,
+            google::protobuf::RepeatedField<double>* field) {
+  const double* begin = values.data() + first * values.rows();
+  field->Add(begin, begin + count * values.rows());
+}
+
+class PredictCall final : public StreamHandler<Request, Response> {
+ public:
+  explicit PredictCall(const ServiceContext& context) : context_(context) {}
+
+  absl::Status OnRequest(Request& request, Sink& sink) override {
+    if (!assembler_) {
+      if (!request.has_header()) return FieldViolation("header", "must be the first message");
+      return TakeHeader(request.header());
+    }
+    if (!request.has_samples()) {
+      return FieldViolation("samples", "are missing: after the header come samples only");
+    }
+    METAEKF_ASSIGN_OR_RETURN(const auto complete, assembler_->Add(request.samples()));
+    return complete ? PredictTrajectory(*complete, sink) : absl::OkStatus();
+  }
+
+  absl::Status OnEnd(Sink& sink) override {
+    if (!assembler_) return FieldViolation("header", "is missing");
+    const std::optional<data::Trajectory> last = assembler_->Finish();
+    if (!last) return FieldViolation("samples", "there are none");
+    return PredictTrajectory(*last, sink);
+  }
+
+ private:
+  absl::Status TakeHeader(const Request::Header& header) {
+    if (header.mode() != Request::ONE_STEP && header.mode() != Request::SIMULATE) {
+      return FieldViolation("header.mode", "say ONE_STEP or SIMULATE");
+    }
+    mode_ = header.mode() == Request::ONE_STEP ? nssm::PredictionMode::kOneStep
+                                               : nssm::PredictionMode::kSimulate;
+    METAEKF_ASSIGN_OR_RETURN(model_, context_.models.Get("header.target", header.target()));
+    METAEKF_ASSIGN_OR_RETURN(const ChannelCounts channels,
+                             MatchChannels("header.channels", header.channels(), model_->bundle));
+    assembler_.emplace(SampleRules{.channels = channels,
+                                   .missing_measurements = true,
+                                   .sample_period_s = model_->bundle.sample_period_s,
+                                   .max_samples = context_.options.limits.samples_per_call});
+    return absl::OkStatus();
+  }
+
+  absl::Status PredictTrajectory(const data::Trajectory& trajectory, Sink& sink) const {
+    METAEKF_RETURN_IF_ERROR(CheckStart(trajectory));
+    METAEKF_ASSIGN_OR_RETURN(const nssm::Prediction prediction,
+                             nssm::Predict(model_->bundle, trajectory, mode_));
+    const Eigen::Index width =
+        std::max<Eigen::Index>(1, prediction.outputs.rows() + prediction.states.rows());
+    const Eigen::Index rows = std::max<Eigen::Index>(1, kValuesPerResponse / width);
+    for (Eigen::Index first = 0; first < trajectory.length(); first += rows) {
+      const Eigen::Index count = std::min(rows, trajectory.length() - first);
+      Response response;
+      response.set_trajectory(trajectory.name);
+      response.set_first_sample(static_cast<uint64_t>(first));
+      response.set_sample_count(static_cast<uint32_t>(count));
+      Append(prediction.outputs, first, count, response.mutable_outputs());
+      Append(prediction.states, first, count, response.mutable_states());
+      response.set_warmup_samples(static_cast<uint32_t>(prediction.warmup));
+      sink.Send(std::move(response));
+    }
+    return absl::OkStatus();
+  }
+
+  /// A free run has nothing but the start to go by, so all of that must be measured.
+  absl::Status CheckStart(const data::Trajectory& trajectory) const {
+    const nssm::ModelSpec& spec = model_->bundle.model.spec();
+    const Eigen::MatrixXd& measured = spec.is_case_one() ? trajectory.outputs : trajectory.states;
+    const Eigen::Index needed = std::min<Eigen::Index>(spec.warmup(), measured.cols());
+    if (mode_ != nssm::PredictionMode::kSimulate || measured.leftCols(needed).allFinite()) {
+      return absl::OkStatus();
+    }
+    return FieldViolation(spec.is_case_one() ? "samples.outputs" : "samples.states",
+                          absl::StrCat("trajectory '", trajectory.name, "': a free run needs the ",
+                                       "first ", spec.warmup(), " measured"));
+  }
+
+  const ServiceContext& context_;
+  nssm::PredictionMode mode_ = nssm::PredictionMode::kOneStep;
+  std::shared_ptr<const ServedModel> model_;
+  std::optional<TrajectoryAssembler> assembler_;  // once the header is there
+};
+
+}  // namespace
+
+std::unique_ptr<StreamHandler<Request, Response>> Predict(const ServiceContext& context) {
+  return std::make_unique<PredictCall>(context);
+}
+
+}  // namespace metaekf::server

@@ -1,0 +1,16 @@
+#pragma once
+
+#include <memory>
+
+#include "metaekf/v1/prediction.pb.h"
+#include "server/handlers/service_context.h"
+#include "server/handlers/stream_handler.h"
+
+namespace metaekf::server {
+
+/// PredictionService.Predict, as prediction.proto describes it. A trajectory is predicted when it
+/// is complete.
+std::unique_ptr<StreamHandler<v1::PredictRequest, v1::PredictResponse>> Predict(
+    const ServiceContext& context);
+
+}  // namespace metaekf::server

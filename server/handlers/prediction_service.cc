@@ -1,0 +1,28 @@
+#include "metaekf/v1/prediction.grpc.pb.h"
+#include "server/handlers/bidi_call.h"
+#include "server/handlers/prediction_handlers.h"
+#include "server/handlers/services.h"
+
+namespace metaekf::server {
+namespace {
+
+class PredictionService final : public v1::PredictionService::CallbackService {
+ public:
+  explicit PredictionService(const ServiceContext& context) : context_(context) {}
+
+  grpc::ServerBidiReactor<v1::PredictRequest, v1::PredictResponse>* Predict(
+      grpc::CallbackServerContext* call) override {
+    return new BidiCall(call, server::Predict(context_), context_.compute, context_.compute);
+  }
+
+ private:
+  const ServiceContext& context_;
+};
+
+}  // namespace
+
+std::unique_ptr<grpc::Service> MakePredictionService(const ServiceContext& context) {
+  return std::make_unique<PredictionService>(context);
+}
+
+}  // namespace metaekf::server

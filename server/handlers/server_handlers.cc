@@ -1,0 +1,29 @@
+#include "server/handlers/server_handlers.h"
+
+#include "core/base/status.h"
+#include "server/convert/time.h"
+
+namespace metaekf::server {
+
+absl::Status GetServerInfo(const ServiceContext& context, const v1::GetServerInfoRequest& request,
+                           v1::ServerInfo* response) {
+  METAEKF_ASSIGN_OR_RETURN(const store::Inventory inventory,
+                           context.store.TakeInventory(request.verify_files()));
+  response->set_version(METAEKF_VERSION);
+  *response->mutable_start_time() = ToTimestamp(context.start_time);
+  v1::DataDirectory& directory = *response->mutable_data_directory();
+  directory.set_format_version(static_cast<uint32_t>(inventory.format_version));
+  directory.set_stored_bytes(static_cast<uint64_t>(inventory.stored_bytes));
+  directory.set_free_disk_bytes(static_cast<uint64_t>(inventory.free_disk_bytes));
+  for (const std::string& problem : inventory.problems) directory.add_problems(problem);
+  directory.set_model_count(static_cast<uint32_t>(inventory.models));
+  directory.set_model_version_count(static_cast<uint32_t>(inventory.versions));
+  directory.set_adaptation_count(static_cast<uint32_t>(inventory.adaptations));
+  directory.set_queued_job_count(static_cast<uint32_t>(inventory.queued_jobs));
+  directory.set_running_job_count(static_cast<uint32_t>(inventory.running_jobs));
+  directory.set_ended_job_count(static_cast<uint32_t>(inventory.ended_jobs));
+  directory.set_session_count(static_cast<uint32_t>(inventory.sessions));
+  return absl::OkStatus();
+}
+
+}  // namespace metaekf::server

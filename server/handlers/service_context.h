@@ -1,0 +1,24 @@
+#pragma once
+
+#include "server/executor/background_executor.h"
+#include "server/options.h"
+#include "server/serving/model_cache.h"
+#include "server/store/store.h"
+#include "server/training/job_feed.h"
+#include "server/training/scheduler.h"
+
+namespace metaekf::server {
+
+/// What the services work with; all of it outlives them.
+struct ServiceContext {
+  store::Store& store;
+  ModelCache& models;
+  BackgroundExecutor& io;       ///< SQL and files
+  BackgroundExecutor& compute;  ///< adaptation and prediction
+  TrainingScheduler& training;
+  JobFeed& jobs;
+  const ServerOptions& options;
+  absl::Time start_time;
+};
+
+}  // namespace metaekf::server

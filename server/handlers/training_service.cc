@@ -1,0 +1,49 @@
+#include "metaekf/v1/training.grpc.pb.h"
+#include "server/handlers/services.h"
+#include "server/handlers/training_handlers.h"
+#include "server/handlers/unary_call.h"
+#include "server/handlers/upload_call.h"
+#include "server/handlers/watch_call.h"
+
+namespace metaekf::server {
+namespace {
+
+using grpc::CallbackServerContext;
+using grpc::ServerUnaryReactor;
+
+class TrainingService final : public v1::TrainingService::CallbackService {
+ public:
+  explicit TrainingService(const ServiceContext& context) : context_(context) {}
+
+  grpc::ServerReadReactor<v1::CreateTrainingJobRequest>* CreateTrainingJob(
+      CallbackServerContext* call, v1::Job* response) override {
+    return new UploadCall(call, server::CreateTrainingJob(context_), context_.io, response);
+  }
+  ServerUnaryReactor* GetJob(CallbackServerContext* call, const v1::GetJobRequest* request,
+                             v1::Job* response) override {
+    return RunUnary(call, context_.io, server::GetJob, context_, request, response);
+  }
+  ServerUnaryReactor* ListJobs(CallbackServerContext* call, const v1::ListJobsRequest* request,
+                               v1::ListJobsResponse* response) override {
+    return RunUnary(call, context_.io, server::ListJobs, context_, request, response);
+  }
+  grpc::ServerWriteReactor<v1::WatchJobResponse>* WatchJob(
+      CallbackServerContext*, const v1::WatchJobRequest* request) override {
+    return new WatchCall(context_, request->name());
+  }
+  ServerUnaryReactor* CancelJob(CallbackServerContext* call, const v1::CancelJobRequest* request,
+                                v1::Job* response) override {
+    return RunUnary(call, context_.io, server::CancelJob, context_, request, response);
+  }
+
+ private:
+  const ServiceContext& context_;
+};
+
+}  // namespace
+
+std::unique_ptr<grpc::Service> MakeTrainingService(const ServiceContext& context) {
+  return std::make_unique<TrainingService>(context);
+}
+
+}  // namespace metaekf::server

@@ -1,0 +1,99 @@
+#include "server/handlers/watch_call.h"
+
+#include "server/convert/jobs.h"
+#include "server/handlers/overload.h"
+#include "server/names/resource_names.h"
+#include "server/status/grpc_status.h"
+
+namespace metaekf::server {
+
+WatchCall::WatchCall(const ServiceContext& context, const std::string& name) : context_(context) {
+  const auto job = ParseJobName("name", name);
+  if (!job.ok()) {
+    FinishWith(job.status());
+    return;
+  }
+  job_ = *job;
+  subscription_ = context_.jobs.Subscribe(job_, [this](JobFeed::Event event) { OnEvent(event); });
+  {
+    std::lock_guard lock(mutex_);
+    state_ = State::kIdle;
+  }
+  Advance();
+}
+
+void WatchCall::OnEvent(JobFeed::Event event) {
+  {
+    std::lock_guard lock(mutex_);
+    changed_ = true;
+    if (event == JobFeed::Event::kClosed) {
+      stop_ = absl::UnavailableError("the server stops; the job goes on when it is back");
+    }
+  }
+  Advance();
+}
+
+void WatchCall::OnCancel() {
+  {
+    std::lock_guard lock(mutex_);
+    stop_ = absl::CancelledError("the call was cancelled");
+  }
+  Advance();
+}
+
+void WatchCall::OnWriteDone(bool ok) {
+  {
+    std::lock_guard lock(mutex_);
+    state_ = State::kIdle;
+    if (ended_) stop_ = absl::OkStatus();
+    if (!ok) stop_ = absl::CancelledError("the call was cancelled");
+  }
+  Advance();
+}
+
+void WatchCall::OnDone() {
+  if (subscription_) context_.jobs.Unsubscribe(*subscription_);
+  delete this;
+}
+
+void WatchCall::Advance() {
+  std::optional<absl::Status> stop;
+  {
+    std::lock_guard lock(mutex_);
+    if (state_ != State::kIdle) return;
+    if (!stop_ && !changed_) return;
+    stop = stop_;
+    state_ = stop ? State::kFinished : State::kBusy;
+    changed_ = false;
+  }
+  if (stop) return Finish(ToGrpcStatus(*stop));
+  if (!context_.io.Submit([this] { Look(); })) FinishWith(Overloaded());
+}
+
+void WatchCall::Look() {
+  const auto job = context_.store.jobs().Get(job_);
+  if (!job.ok()) return FinishWith(job.status());
+  response_ = ToWatchResponse(*job);
+  std::string told = response_.SerializeAsString();
+  if (told == last_told_) {
+    {
+      std::lock_guard lock(mutex_);
+      state_ = State::kIdle;
+    }
+    return Advance();
+  }
+  last_told_ = std::move(told);
+  ended_ = job->state != store::JobState::kQueued && job->state != store::JobState::kRunning;
+  StartWrite(&response_);
+}
+
+/// While busy, so that nothing else is under way.
+void WatchCall::FinishWith(const absl::Status& status) {
+  {
+    std::lock_guard lock(mutex_);
+    state_ = State::kFinished;
+  }
+  Finish(ToGrpcStatus(status));
+}
+
+}  // namespace metaekf::server

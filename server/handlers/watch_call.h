@@ -1,0 +1,47 @@
+#pragma once
+
+#include <grpcpp/support/server_callback.h>
+
+#include <cstdint>
+#include <mutex>
+#include <optional>
+#include <string>
+
+#include "metaekf/v1/training.pb.h"
+#include "server/handlers/service_context.h"
+
+namespace metaekf::server {
+
+/// A WatchJob call: tells the job as it stands, then again whenever it has changed. Changes while
+/// the client reads are told together. Owns itself until the call is done.
+class WatchCall final : public grpc::ServerWriteReactor<v1::WatchJobResponse> {
+ public:
+  WatchCall(const ServiceContext& context, const std::string& name);
+
+  void OnWriteDone(bool ok) override;
+  void OnCancel() override;
+  void OnDone() override;
+
+ private:
+  enum class State { kIdle, kBusy, kFinished };
+
+  void OnEvent(JobFeed::Event event);
+  /// Looks at the job on the executor, unless that or a write is under way.
+  void Advance();
+  void Look();
+  void FinishWith(const absl::Status& status);
+
+  const ServiceContext& context_;
+  int64_t job_ = 0;
+  std::optional<int64_t> subscription_;
+  v1::WatchJobResponse response_;
+  std::string last_told_;
+  bool ended_ = false;  // the job has, and the client was told
+
+  std::mutex mutex_;
+  State state_ = State::kBusy;
+  bool changed_ = true;
+  std::optional<absl::Status> stop_;  // why to end as soon as nothing is under way
+};
+
+}  // namespace metaekf::server

@@ -1,0 +1,42 @@
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <string>
+
+#include "absl/time/time.h"
+
+namespace metaekf::server {
+
+/// How a server runs. deploy/metaekfd.textproto says what each means; zero where that says so.
+struct ServerOptions {
+  std::string data_directory;
+  std::string listen = "127.0.0.1:50051";
+  bool insecure = false;  ///< listens beyond loopback although nothing is encrypted
+
+  int64_t model_cache_bytes = int64_t{512} << 20;
+  size_t io_threads = 4;
+  size_t compute_threads = 0;  ///< 0: half the cores, at least 1
+  absl::Duration drain_timeout = absl::Seconds(10);
+
+  struct Training {
+    size_t concurrent_jobs = 1;
+    size_t threads_per_job = 0;  ///< 0: one per core
+    size_t max_queued_jobs = 100;
+    absl::Duration checkpoint_period = absl::Seconds(5);
+    std::string worker_binary = "/proc/self/exe";
+  } training;
+
+  struct Limits {
+    int64_t memory_bytes = 0;  ///< of gRPC's buffers; 0: a quarter of the machine's memory
+    int64_t message_bytes = int64_t{4} << 20;
+    int64_t metadata_bytes = int64_t{16} << 10;
+    int64_t streams_per_connection = 1024;
+    int64_t model_file_bytes = int64_t{256} << 20;
+    int64_t dataset_bytes = int64_t{8} << 30;
+    int64_t samples_per_call = 16'000'000;  ///< of an adaptation or prediction
+    int64_t queued_calls = 1024;
+  } limits;
+};
+
+}  // namespace metaekf::server
