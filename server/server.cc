@@ -9,6 +9,7 @@
 #include <unistd.h>
 
 #include <algorithm>
+#include <chrono>
 #include <optional>
 #include <thread>
 #include <vector>
@@ -19,6 +20,7 @@
 #include "core/base/status.h"
 #include "server/handlers/services.h"
 #include "server/keep_warm.h"
+#include "server/session/estimation_service.h"
 
 namespace metaekf::server {
 namespace {
@@ -102,7 +104,9 @@ class Server::Parts {
         compute({.threads = ComputeThreads(options.compute_threads),
                  .max_queued = Queued(),
                  .nice = 5}),
-        context{*store, models, io, compute, training, jobs, options, absl::Now()} {
+        context{*store, models, io, compute, training, jobs, options, absl::Now()},
+        sessions(*store, models),
+        estimation(sessions, io) {
     services.push_back(MakeModelService(context));
     services.push_back(MakeTrainingService(context));
     services.push_back(MakeAdaptationService(context));
@@ -118,6 +122,7 @@ class Server::Parts {
     host = address.host;
     builder.AddListeningPort(options.listen, grpc::InsecureServerCredentials(), &port);
     for (const auto& service : services) builder.RegisterService(service.get());
+    builder.RegisterService(&estimation);
     grpc_server = builder.BuildAndStart();
     if (grpc_server == nullptr || port == 0) {
       return absl::FailedPreconditionError(
@@ -135,6 +140,7 @@ class Server::Parts {
     keep_warm.reset();
     jobs.Close();
     std::thread checkpoints([this] { training.Stop(); });
+    estimation.Drain(std::chrono::steady_clock::now() + absl::ToChronoMilliseconds(timeout / 2));
     grpc_server->Shutdown(deadline);
     checkpoints.join();
     grpc_server.reset();
@@ -150,6 +156,8 @@ class Server::Parts {
   BackgroundExecutor io;
   BackgroundExecutor compute;
   const ServiceContext context;
+  SessionManager sessions;
+  EstimationService estimation;
   std::vector<std::unique_ptr<grpc::Service>> services;
   std::unique_ptr<grpc::Server> grpc_server;
   std::optional<KeepWarm> keep_warm;

@@ -3,6 +3,8 @@
 #include <grpcpp/server_context.h>
 #include <grpcpp/support/server_callback.h>
 
+#include <utility>
+
 #include "server/executor/background_executor.h"
 #include "server/handlers/overload.h"
 #include "server/handlers/service_context.h"
@@ -10,20 +12,27 @@
 
 namespace metaekf::server {
 
-/// Answers a call with what `handler` leaves in the response.
-template <class Request, class Response>
+/// Answers a call with what `work`, which returns an absl::Status, leaves in its response. Request
+/// and response live until then.
+template <class Work>
 grpc::ServerUnaryReactor* RunUnary(grpc::CallbackServerContext* call, BackgroundExecutor& executor,
-                                   absl::Status (*handler)(const ServiceContext&, const Request&,
-                                                           Response*),
-                                   const ServiceContext& context, const Request* request,
-                                   Response* response) {
+                                   Work work) {
   grpc::ServerUnaryReactor* reactor = call->DefaultReactor();
-  const bool accepted = executor.Submit([=, &context] {
+  const bool accepted = executor.Submit([call, reactor, work = std::move(work)] {
     if (call->IsCancelled()) return reactor->Finish(grpc::Status::CANCELLED);
-    reactor->Finish(ToGrpcStatus(handler(context, *request, response)));
+    reactor->Finish(ToGrpcStatus(work()));
   });
   if (!accepted) reactor->Finish(ToGrpcStatus(Overloaded()));
   return reactor;
+}
+
+/// The same with a handler of this folder.
+template <class Request, class Response>
+grpc::ServerUnaryReactor* RunUnary(grpc::CallbackServerContext* call, const ServiceContext& context,
+                                   absl::Status (*handler)(const ServiceContext&, const Request&,
+                                                           Response*),
+                                   const Request* request, Response* response) {
+  return RunUnary(call, context.io, [=, &context] { return handler(context, *request, response); });
 }
 
 }  // namespace metaekf::server

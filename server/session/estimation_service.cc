@@ -1,0 +1,340 @@
+#include "server/session/estimation_service.h"
+
+#include <algorithm>
+#include <optional>
+#include <vector>
+
+#include "absl/strings/str_cat.h"
+#include "core/base/status.h"
+#include "server/handlers/overload.h"
+#include "server/handlers/unary_call.h"
+#include "server/names/resource_names.h"
+#include "server/status/details.h"
+#include "server/status/grpc_status.h"
+
+namespace metaekf::server {
+
+using std::chrono::steady_clock;
+
+namespace {
+
+constexpr std::chrono::seconds kSlowReader(10);      // a response that waits longer ends the stream
+constexpr std::chrono::milliseconds kSweepPeriod(500);
+constexpr std::chrono::microseconds kLongReaction(100);
+constexpr size_t kMaxHeavyBatches = 20'000;  // each stream has one at most
+
+absl::Status TakenOver() {
+  return WithReason(absl::AbortedError("another stream has resumed the session, or it was deleted"), "SESSION_TAKEN_OVER", {});
+}
+
+absl::Status Draining(uint64_t durable_seq) {
+  return WithReason(
+      absl::UnavailableError(absl::StrCat("the server stops; resume after sample ", durable_seq, " when it is back")),
+      "DRAINING", {{"durable_seq", absl::StrCat(durable_seq)}});
+}
+
+}  // namespace
+
+/// One stream: open or resume, then batch by batch. At any time at most one read and one write are in flight and one
+/// batch is in work; the next batch waits for the response before it. `mutex_` guards everything; the batch itself is
+/// applied without it.
+class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse> {
+ public:
+  EstimateStream(EstimationService* service, grpc::CallbackServerContext* context)
+      : service_(*service), context_(context) {}
+
+  void Start(bool draining) {
+    std::lock_guard lock(mutex_);
+    if (draining) finish_with_ = Draining(0);
+    Advance();
+  }
+
+  void OnReadDone(bool ok) override {
+    std::lock_guard lock(mutex_);
+    reading_ = false;
+    (ok ? has_request_ : half_closed_) = true;
+    Advance();
+  }
+
+  void OnWriteDone(bool ok) override {
+    std::lock_guard lock(mutex_);
+    writing_ = false;
+    if (!ok) End(absl::CancelledError("the client has gone"));
+    Advance();
+  }
+
+  void OnCancel() override {
+    std::lock_guard lock(mutex_);
+    End(absl::CancelledError("the call was cancelled"));
+    Advance();
+  }
+
+  void OnDone() override {
+    if (live_ != nullptr) service_.sessions_.Close(live_);
+    service_.Remove(this);
+    delete this;
+  }
+
+  /// First half of a drain: applies nothing more.
+  void StopApplying() {
+    std::lock_guard lock(mutex_);
+    stop_applying_ = true;
+  }
+
+  /// Second half: all that was applied is durable.
+  void EndForDrain() {
+    std::lock_guard lock(mutex_);
+    uint64_t durable = 0;
+    if (live_ != nullptr) {
+      std::lock_guard session_lock(live_->mutex);
+      durable = live_->durable_seq;
+    }
+    End(Draining(durable));
+    Advance();
+  }
+
+  /// Ends a stream whose client does not read or whose session is no longer its own.
+  void Sweep(steady_clock::time_point now) {
+    std::lock_guard lock(mutex_);
+    if (writing_ && now - write_start_ > kSlowReader) {
+      End(absl::ResourceExhaustedError("responses were not read for ten seconds"));
+      context_->TryCancel();  // an outstanding write ends only so
+    }
+    if (live_ != nullptr && !working_) {
+      std::lock_guard session_lock(live_->mutex);
+      if (live_->taken_over) End(TakenOver());
+    }
+    Advance();
+  }
+
+  void Cancel() { context_->TryCancel(); }
+
+ private:
+  void End(absl::Status status) {
+    if (!finish_with_) finish_with_ = std::move(status);
+  }
+
+  /// Starts whatever may start now. With mutex_ held; every event ends here.
+  void Advance() {
+    if (finished_ || working_) return;
+    if (finish_with_) {
+      if (writing_) return;
+      finished_ = true;
+      Finish(ToGrpcStatus(*finish_with_));
+      return;
+    }
+    if (has_request_ && !writing_ && !stop_applying_) {
+      has_request_ = false;
+      request_.Swap(&work_);
+      working_ = true;
+      if (!half_closed_) {
+        reading_ = true;
+        StartRead(&request_);
+      }
+      StartWork();
+      return;
+    }
+    if (half_closed_ && !has_request_) {
+      End(live_ == nullptr ? absl::InvalidArgumentError("the first request must open or resume a session")
+                           : absl::OkStatus());
+      return Advance();
+    }
+    if (!reading_ && !has_request_ && !half_closed_) {
+      reading_ = true;
+      StartRead(&request_);
+    }
+  }
+
+  /// With mutex_ held and working_ set.
+  void StartWork() {
+    bool accepted = true;
+    if (live_ == nullptr) {
+      accepted = service_.io_.Submit([this] { Work([this] { return OpenOrResume(); }); });
+    } else if (work_.samples().outputs_size() * time_per_value_ > kLongReaction) {
+      accepted = service_.heavy_.Submit([this] { Work([this] { return Apply(); }); });
+    } else {
+      // The batch is short: applied in this reaction, but without the mutex, which the caller holds.
+      mutex_.unlock();
+      const absl::Status status = Apply();
+      mutex_.lock();
+      WorkDone(status);
+    }
+    if (!accepted) WorkDone(Overloaded());
+  }
+
+  template <typename Function>
+  void Work(const Function& function) {
+    const absl::Status status = function();
+    std::lock_guard lock(mutex_);
+    WorkDone(status);
+  }
+
+  /// With mutex_ held.
+  void WorkDone(const absl::Status& status) {
+    working_ = false;
+    if (!status.ok()) {
+      End(status);
+    } else if (response_.kind_case() != v1::EstimateResponse::KIND_NOT_SET && !finish_with_) {
+      writing_ = true;
+      write_start_ = steady_clock::now();
+      StartWrite(&response_);
+    }
+    Advance();
+  }
+
+  absl::Status OpenOrResume() {
+    absl::StatusOr<std::shared_ptr<LiveSession>> live;
+    switch (work_.kind_case()) {
+      case v1::EstimateRequest::kOpen:
+        live = service_.sessions_.Open(work_.open());
+        break;
+      case v1::EstimateRequest::kResume:
+        live = service_.sessions_.Resume(work_.resume());
+        break;
+      default:
+        return FieldViolation("kind", "the first request must open or resume a session");
+    }
+    if (!live.ok()) return live.status();
+    v1::SessionOpened* opened = response_.mutable_opened();
+    {
+      std::lock_guard session_lock((*live)->mutex);
+      (*live)->session->Describe(opened);
+      opened->set_session(SessionName((*live)->number));
+      opened->set_token((*live)->token);
+      opened->set_epoch((*live)->epoch);
+      opened->set_durable_seq((*live)->durable_seq);
+      // A batch of the largest models takes about 20 ns per parameter and output; measured from the first batch on.
+      time_per_value_ = std::chrono::nanoseconds(
+          static_cast<int64_t>((*live)->session->model().bundle.parameters.size()));
+    }
+    std::lock_guard lock(mutex_);
+    live_ = *std::move(live);
+    return absl::OkStatus();
+  }
+
+  absl::Status Apply() {
+    if (work_.kind_case() != v1::EstimateRequest::kSamples) {
+      return FieldViolation("kind", "the session is open: send samples");
+    }
+    response_.Clear();
+    const steady_clock::time_point start = steady_clock::now();
+    std::unique_ptr<filter::FilterModel::Scratch> scratch = live_->scratch->Take();
+    absl::Status status;
+    bool applied = false;
+    {
+      std::lock_guard session_lock(live_->mutex);
+      if (live_->taken_over) {
+        status = TakenOver();
+      } else {
+        v1::EstimateBatch* estimates = response_.mutable_estimates();
+        status = live_->session->Apply(work_.samples(), scratch.get(), estimates);
+        estimates->set_durable_seq(live_->durable_seq);
+        applied = estimates->nis_size() > 0;
+        if (!applied) estimates->set_first_seq(live_->session->applied_seq());
+      }
+    }
+    live_->scratch->GiveBack(std::move(scratch));
+    if (applied) service_.sessions_.MarkDirty(live_);
+    const int values = work_.samples().outputs_size();
+    if (values > 0) time_per_value_ = (steady_clock::now() - start) / values;
+    return status;
+  }
+
+  EstimationService& service_;
+  grpc::CallbackServerContext* const context_;
+  v1::EstimateRequest request_;    // being read, or waiting
+  v1::EstimateRequest work_;       // being worked on
+  v1::EstimateResponse response_;  // being made or written
+  std::shared_ptr<LiveSession> live_;
+  steady_clock::duration time_per_value_{};  // of outputs in a batch, as last measured
+
+  std::mutex mutex_;
+  bool reading_ = false;
+  bool has_request_ = false;  // request_ holds a request that waits
+  bool half_closed_ = false;
+  bool working_ = false;
+  bool writing_ = false;
+  bool stop_applying_ = false;
+  bool finished_ = false;
+  std::optional<absl::Status> finish_with_;
+  steady_clock::time_point write_start_;
+};
+
+EstimationService::EstimationService(SessionManager& sessions, BackgroundExecutor& io)
+    : sessions_(sessions), io_(io), heavy_({.threads = 2, .max_queued = kMaxHeavyBatches}), sweeps_([this] { RunSweeps(); }) {}
+
+EstimationService::~EstimationService() {
+  {
+    std::lock_guard lock(mutex_);
+    stopping_ = true;
+  }
+  changed_.notify_all();
+  sweeps_.join();
+}
+
+grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse>* EstimationService::Estimate(
+    grpc::CallbackServerContext* context) {
+  auto* stream = new EstimateStream(this, context);
+  bool draining;
+  {
+    std::lock_guard lock(mutex_);
+    streams_.insert(stream);
+    draining = draining_;
+  }
+  stream->Start(draining);
+  return stream;
+}
+
+void EstimationService::Remove(EstimateStream* stream) {
+  std::lock_guard lock(mutex_);
+  streams_.erase(stream);
+  changed_.notify_all();
+}
+
+// Streams leave the set, with mutex_, before they are deleted: what is found in it while mutex_ is held is alive.
+void EstimationService::RunSweeps() {
+  std::unique_lock lock(mutex_);
+  while (!changed_.wait_for(lock, kSweepPeriod, [this] { return stopping_; })) {
+    const steady_clock::time_point now = steady_clock::now();
+    for (EstimateStream* stream : streams_) stream->Sweep(now);
+  }
+}
+
+void EstimationService::Drain(steady_clock::time_point deadline) {
+  {
+    std::lock_guard lock(mutex_);
+    draining_ = true;
+    for (EstimateStream* stream : streams_) stream->StopApplying();
+  }
+  sessions_.Flush();
+  std::unique_lock lock(mutex_);
+  for (EstimateStream* stream : streams_) stream->EndForDrain();
+  if (changed_.wait_until(lock, deadline, [this] { return streams_.empty(); })) return;
+  for (EstimateStream* stream : streams_) stream->Cancel();
+  changed_.wait(lock, [this] { return streams_.empty(); });
+}
+
+grpc::ServerUnaryReactor* EstimationService::GetSession(grpc::CallbackServerContext* context,
+                                                        const v1::GetSessionRequest* request, v1::Session* response) {
+  return FinishWith(context, io_, [this, request, response]() -> absl::Status {
+    METAEKF_ASSIGN_OR_RETURN(*response, sessions_.Get(request->name()));
+    return absl::OkStatus();
+  });
+}
+
+grpc::ServerUnaryReactor* EstimationService::ListSessions(grpc::CallbackServerContext* context,
+                                                          const v1::ListSessionsRequest* request,
+                                                          v1::ListSessionsResponse* response) {
+  return FinishWith(context, io_, [this, request, response]() -> absl::Status {
+    METAEKF_ASSIGN_OR_RETURN(*response, sessions_.List(*request));
+    return absl::OkStatus();
+  });
+}
+
+grpc::ServerUnaryReactor* EstimationService::DeleteSession(grpc::CallbackServerContext* context,
+                                                           const v1::DeleteSessionRequest* request,
+                                                           google::protobuf::Empty*) {
+  return FinishWith(context, io_, [this, request] { return sessions_.Delete(request->name()); });
+}
+
+}  // namespace metaekf::server

@@ -1,0 +1,54 @@
+#pragma once
+
+#include <chrono>
+#include <condition_variable>
+#include <mutex>
+#include <set>
+#include <thread>
+
+#include "metaekf/v1/estimation.grpc.pb.h"
+#include "server/executor/background_executor.h"
+#include "server/session/session_manager.h"
+
+namespace metaekf::server {
+
+class EstimateStream;
+
+/// The EstimationService of the wire over a SessionManager.
+class EstimationService : public v1::EstimationService::CallbackService {
+ public:
+  /// @param io  for SQL and files. All arguments outlive the service.
+  EstimationService(SessionManager& sessions, BackgroundExecutor& io);
+  ~EstimationService() override;
+
+  /// Ends every stream with UNAVAILABLE (DRAINING, durable_seq) once its last response is out, and refuses new ones.
+  /// Returns when all are gone, or at the deadline: what is left then is cancelled.
+  void Drain(std::chrono::steady_clock::time_point deadline);
+
+  grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse>* Estimate(
+      grpc::CallbackServerContext* context) override;
+  grpc::ServerUnaryReactor* GetSession(grpc::CallbackServerContext* context, const v1::GetSessionRequest* request,
+                                       v1::Session* response) override;
+  grpc::ServerUnaryReactor* ListSessions(grpc::CallbackServerContext* context, const v1::ListSessionsRequest* request,
+                                         v1::ListSessionsResponse* response) override;
+  grpc::ServerUnaryReactor* DeleteSession(grpc::CallbackServerContext* context, const v1::DeleteSessionRequest* request,
+                                          google::protobuf::Empty* response) override;
+
+ private:
+  friend class EstimateStream;
+  void Remove(EstimateStream* stream);
+  void RunSweeps();
+
+  SessionManager& sessions_;
+  BackgroundExecutor& io_;
+  BackgroundExecutor heavy_;  // batches that take longer than a reaction may
+
+  std::mutex mutex_;
+  std::condition_variable changed_;
+  std::set<EstimateStream*> streams_;
+  bool draining_ = false;
+  bool stopping_ = false;
+  std::thread sweeps_;
+};
+
+}  // namespace metaekf::server

@@ -1,0 +1,212 @@
+#include "server/session/session_manager.h"
+
+#include <spdlog/spdlog.h>
+
+#include <chrono>
+
+#include "core/base/status.h"
+#include "server/convert/time.h"
+#include "server/names/resource_names.h"
+#include "server/status/details.h"
+
+namespace metaekf::server {
+namespace {
+
+constexpr std::chrono::milliseconds kCommitPeriod(100);
+
+}  // namespace
+
+std::unique_ptr<filter::FilterModel::Scratch> ScratchPool::Take() {
+  {
+    std::lock_guard lock(mutex_);
+    if (!free_.empty()) {
+      auto scratch = std::move(free_.back());
+      free_.pop_back();
+      return scratch;
+    }
+  }
+  return model_->MakeScratch();
+}
+
+void ScratchPool::GiveBack(std::unique_ptr<filter::FilterModel::Scratch> scratch) {
+  std::lock_guard lock(mutex_);
+  free_.push_back(std::move(scratch));
+}
+
+SessionManager::SessionManager(store::Store& store, ModelCache& models)
+    : store_(store), models_(models), checkpoints_([this] { RunCheckpoints(); }) {}
+
+SessionManager::~SessionManager() {
+  {
+    std::lock_guard lock(mutex_);
+    stopping_ = true;
+  }
+  stop_.notify_all();
+  checkpoints_.join();
+  Flush();
+}
+
+void SessionManager::RunCheckpoints() {
+  std::unique_lock lock(mutex_);
+  while (!stop_.wait_for(lock, kCommitPeriod, [this] { return stopping_; })) {
+    if (dirty_.empty()) continue;
+    lock.unlock();
+    Flush();
+    lock.lock();
+  }
+}
+
+absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Open(const v1::OpenSession& open) {
+  METAEKF_ASSIGN_OR_RETURN(const std::shared_ptr<const ServedModel> model, models_.Get("open.target", open.target()));
+  // What is stored is the version that the name means now: a resumed session goes on with the same weights.
+  v1::OpenSession settings = open;
+  settings.set_target(model->adaptation.empty() ? model->model_version : model->adaptation);
+  METAEKF_RETURN_IF_ERROR(Session::Open(model, settings).status());
+  METAEKF_ASSIGN_OR_RETURN(const store::NewSession made,
+                           store_.sessions().Create(settings.target(), settings.SerializeAsString()));
+  return Attach(made.session, settings, made.token);
+}
+
+absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Resume(const v1::ResumeSession& resume) {
+  METAEKF_ASSIGN_OR_RETURN(const int64_t number, ParseSessionName("resume.session", resume.session()));
+  // What an earlier stream applied here need not be sent again.
+  Flush();
+  METAEKF_ASSIGN_OR_RETURN(const store::Session stored, store_.sessions().Claim(number, resume.token()));
+  v1::OpenSession settings;
+  if (!settings.ParseFromString(stored.settings)) return absl::DataLossError("the session's settings are damaged");
+  return Attach(stored, settings, "");
+}
+
+absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Attach(const store::Session& stored,
+                                                                    const v1::OpenSession& settings,
+                                                                    const std::string& token) {
+  METAEKF_ASSIGN_OR_RETURN(const std::shared_ptr<const ServedModel> model, models_.Get("target", settings.target()));
+  auto live = std::make_shared<LiveSession>();
+  live->number = stored.number;
+  live->epoch = static_cast<uint64_t>(stored.epoch);
+  live->token = token;
+  live->durable_seq = static_cast<uint64_t>(stored.durable_seq);
+  METAEKF_ASSIGN_OR_RETURN(live->session, Session::Open(model, settings));
+  if (!stored.checkpoint.empty()) METAEKF_RETURN_IF_ERROR(live->session->Restore(stored.checkpoint));
+  live->scratch = PoolOf(model->filter_model);
+  std::shared_ptr<LiveSession> before;
+  {
+    std::lock_guard lock(mutex_);
+    before = std::exchange(live_[stored.number], live);
+  }
+  if (before != nullptr) {
+    std::lock_guard lock(before->mutex);
+    before->taken_over = true;
+  }
+  return live;
+}
+
+std::shared_ptr<ScratchPool> SessionManager::PoolOf(const std::shared_ptr<const filter::FilterModel>& model) {
+  std::lock_guard lock(mutex_);
+  std::erase_if(pools_, [](const std::weak_ptr<ScratchPool>& pool) { return pool.expired(); });
+  for (const std::weak_ptr<ScratchPool>& weak : pools_) {
+    std::shared_ptr<ScratchPool> pool = weak.lock();
+    if (pool != nullptr && pool->model() == model) return pool;
+  }
+  auto pool = std::make_shared<ScratchPool>(model);
+  pools_.push_back(pool);
+  return pool;
+}
+
+void SessionManager::MarkDirty(const std::shared_ptr<LiveSession>& live) {
+  std::lock_guard lock(mutex_);
+  dirty_.insert(live);
+}
+
+void SessionManager::Close(const std::shared_ptr<LiveSession>& live) {
+  std::lock_guard lock(mutex_);
+  const auto it = live_.find(live->number);
+  if (it != live_.end() && it->second == live) live_.erase(it);
+}
+
+void SessionManager::Flush() {
+  std::lock_guard one_at_a_time(flush_mutex_);
+  std::vector<std::shared_ptr<LiveSession>> sessions;
+  {
+    std::lock_guard lock(mutex_);
+    sessions.assign(dirty_.begin(), dirty_.end());
+    dirty_.clear();
+  }
+  if (sessions.empty()) return;
+  std::vector<store::SessionCheckpoint> checkpoints;
+  for (const std::shared_ptr<LiveSession>& live : sessions) {
+    std::lock_guard lock(live->mutex);
+    checkpoints.push_back({live->number, static_cast<int64_t>(live->epoch),
+                           static_cast<int64_t>(live->session->applied_seq()), live->session->Checkpoint()});
+  }
+  const absl::StatusOr<std::vector<bool>> written = store_.sessions().SaveCheckpoints(checkpoints);
+  if (!written.ok()) {
+    // Nothing became durable; clients keep their samples. The next commit tries again.
+    spdlog::error("checkpoints of {} sessions not written: {}", sessions.size(), written.status().ToString());
+    std::lock_guard lock(mutex_);
+    dirty_.insert(sessions.begin(), sessions.end());
+    return;
+  }
+  for (size_t i = 0; i < sessions.size(); ++i) {
+    std::lock_guard lock(sessions[i]->mutex);
+    if ((*written)[i]) {
+      sessions[i]->durable_seq = static_cast<uint64_t>(checkpoints[i].durable_seq);
+    } else {
+      sessions[i]->taken_over = true;
+    }
+  }
+}
+
+v1::Session SessionManager::ToMessage(const store::Session& stored) {
+  v1::Session message;
+  message.set_name(SessionName(stored.number));
+  message.set_target(stored.target);
+  message.set_epoch(static_cast<uint64_t>(stored.epoch));
+  message.set_durable_seq(static_cast<uint64_t>(stored.durable_seq));
+  *message.mutable_create_time() = ToTimestamp(stored.create_time);
+  std::shared_ptr<LiveSession> live;
+  {
+    std::lock_guard lock(mutex_);
+    const auto it = live_.find(stored.number);
+    if (it != live_.end()) live = it->second;
+  }
+  if (live != nullptr) {
+    std::lock_guard lock(live->mutex);
+    message.set_streaming(true);
+    message.set_applied_seq(live->session->applied_seq());
+  }
+  return message;
+}
+
+absl::StatusOr<v1::Session> SessionManager::Get(const std::string& name) {
+  METAEKF_ASSIGN_OR_RETURN(const int64_t number, ParseSessionName("name", name));
+  METAEKF_ASSIGN_OR_RETURN(const store::Session stored, store_.sessions().Get(number));
+  return ToMessage(stored);
+}
+
+absl::StatusOr<v1::ListSessionsResponse> SessionManager::List(const v1::ListSessionsRequest& request) {
+  METAEKF_ASSIGN_OR_RETURN(const store::Page<store::Session> page,
+                           store_.sessions().List({request.page_size(), request.page_token()}));
+  v1::ListSessionsResponse response;
+  for (const store::Session& stored : page.items) *response.add_sessions() = ToMessage(stored);
+  response.set_next_page_token(page.next_page_token);
+  return response;
+}
+
+absl::Status SessionManager::Delete(const std::string& name) {
+  METAEKF_ASSIGN_OR_RETURN(const int64_t number, ParseSessionName("name", name));
+  METAEKF_RETURN_IF_ERROR(store_.sessions().Delete(number));
+  std::shared_ptr<LiveSession> live;
+  {
+    std::lock_guard lock(mutex_);
+    const auto it = live_.find(number);
+    if (it != live_.end()) live = it->second;
+  }
+  if (live != nullptr) {
+    std::lock_guard lock(live->mutex);
+    live->taken_over = true;
+  }
+  return absl::OkStatus();
+}
+
+}  // namespace metaekf::server

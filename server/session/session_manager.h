@@ -1,0 +1,87 @@
+#pragma once
+
+#include <condition_variable>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <set>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "absl/status/statusor.h"
+#include "server/serving/model_cache.h"
+#include "server/session/session.h"
+#include "server/store/store.h"
+
+namespace metaekf::server {
+
+/// Scratch memory for the filters of one model, lent for the duration of a batch.
+class ScratchPool {
+ public:
+  explicit ScratchPool(std::shared_ptr<const filter::FilterModel> model) : model_(std::move(model)) {}
+
+  std::unique_ptr<filter::FilterModel::Scratch> Take();
+  void GiveBack(std::unique_ptr<filter::FilterModel::Scratch> scratch);
+  const std::shared_ptr<const filter::FilterModel>& model() const { return model_; }
+
+ private:
+  const std::shared_ptr<const filter::FilterModel> model_;
+  std::mutex mutex_;
+  std::vector<std::unique_ptr<filter::FilterModel::Scratch>> free_;
+};
+
+/// A session that a stream serves. `mutex` guards all but the constants.
+struct LiveSession {
+  int64_t number = 0;
+  uint64_t epoch = 0;
+  std::string token;  ///< of a session just made; empty when resumed
+  std::shared_ptr<ScratchPool> scratch;
+
+  std::mutex mutex;
+  std::unique_ptr<Session> session;
+  uint64_t durable_seq = 0;
+  bool taken_over = false;  ///< another stream has claimed the session
+};
+
+/// Sessions between their streams and the store. Safe to call concurrently; Open, Resume, Flush and Delete block on
+/// SQL and files.
+class SessionManager {
+ public:
+  SessionManager(store::Store& store, ModelCache& models);
+  ~SessionManager();
+
+  absl::StatusOr<std::shared_ptr<LiveSession>> Open(const v1::OpenSession& open);
+  absl::StatusOr<std::shared_ptr<LiveSession>> Resume(const v1::ResumeSession& resume);
+
+  /// Notes that samples were applied: they become durable with the next commit.
+  void MarkDirty(const std::shared_ptr<LiveSession>& live);
+  /// The stream has ended; what it applied last is still written.
+  void Close(const std::shared_ptr<LiveSession>& live);
+  /// Writes what is dirty now.
+  void Flush();
+
+  absl::StatusOr<v1::Session> Get(const std::string& name);
+  absl::StatusOr<v1::ListSessionsResponse> List(const v1::ListSessionsRequest& request);
+  absl::Status Delete(const std::string& name);
+
+ private:
+  absl::StatusOr<std::shared_ptr<LiveSession>> Attach(const store::Session& stored, const v1::OpenSession& settings,
+                                                      const std::string& token);
+  std::shared_ptr<ScratchPool> PoolOf(const std::shared_ptr<const filter::FilterModel>& model);
+  v1::Session ToMessage(const store::Session& stored);
+  void RunCheckpoints();
+
+  store::Store& store_;
+  ModelCache& models_;
+  std::mutex mutex_;
+  std::map<int64_t, std::shared_ptr<LiveSession>> live_;
+  std::set<std::shared_ptr<LiveSession>> dirty_;
+  std::vector<std::weak_ptr<ScratchPool>> pools_;
+  bool stopping_ = false;
+  std::condition_variable stop_;
+  std::mutex flush_mutex_;  // one commit at a time
+  std::thread checkpoints_;
+};
+
+}  // namespace metaekf::server

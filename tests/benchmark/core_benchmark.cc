@@ -1,0 +1,171 @@
+// See README.md beside this file.
+
+#include <sys/resource.h>
+
+#include <algorithm>
+#include <array>
+#include <chrono>
+#include <cstdio>
+#include <functional>
+#include <string>
+#include <vector>
+
+#include "core/base/json_fields.h"
+#include "core/filter/ekf.h"
+#include "core/meta/meta_gradient.h"
+#include "tests/core/nssm/random_models.h"
+#include "tests/support/bundles.h"
+
+namespace metaekf {
+namespace {
+
+using autodiff::Activation;
+
+double MedianSeconds(int repeats, const std::function<void()>& work) {
+  work();
+  std::vector<double> seconds;
+  for (int i = 0; i < repeats; ++i) {
+    const auto start = std::chrono::steady_clock::now();
+    work();
+    seconds.push_back(std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count());
+  }
+  std::nth_element(seconds.begin(), seconds.begin() + repeats / 2, seconds.end());
+  return seconds[static_cast<size_t>(repeats / 2)];
+}
+
+/// The paper's localisation network: states (p_X, p_Y, heading), three inputs, the magnetic field as a gradient.
+nssm::ModelSpec LocalisationSpec() {
+  const auto block = [](std::vector<int32_t> widths) {
+    return nn::BlockSpec{.hidden_widths = std::move(widths), .activation = Activation::kSwish};
+  };
+  nssm::ModelSpec spec{.kind = nssm::Case::kStateInputOutput, .input_size = 3, .output_size = 2, .state_size = 3, .latent_size = 128, .window = 1};
+  spec.encoder = block({256, 128, 128, 64, 32, 32});
+  spec.transition.block = block({256, 256, 256, 256, 256, 256});
+  spec.transition.form = nssm::TransitionForm::kAutonomous;
+  spec.state_decoder = block({32, 64, 128, 256});
+  spec.output_decoder = block({64, 64, 128, 128, 256, 256});
+  spec.curl_free_positions = {0, 1};
+  return spec;
+}
+
+double EkfStepSeconds() {
+  nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(LocalisationSpec()));
+  bundle.parameters = bundle.model.InitialParameters(1);
+  const std::shared_ptr<filter::FilterModel> model = filter::FilterModel::Create(bundle.model);
+  filter::Ekf ekf = *filter::Ekf::Create(bundle, model, model->Prepare(bundle.parameters), {});
+  const auto scratch = model->MakeScratch();
+  filter::Estimate estimate = ekf.MakeEstimate();
+  const Eigen::VectorXd u = Eigen::VectorXd::Constant(3, 0.3), y = Eigen::VectorXd::Constant(2, 0.1);
+  (void)ekf.Step(u, y, scratch.get(), &estimate);  // the first step has no time update
+  return MedianSeconds(2000, [&] { (void)ekf.Step(u, y, scratch.get(), &estimate); });
+}
+
+struct MetaSeconds {
+  double adapt, maml, fomaml;
+};
+
+MetaSeconds LocalisationLearning() {
+  constexpr int kSamples = 81;  // 80 one-step predictions
+  constexpr int kSteps = 10;
+  const nssm::ModelSpec spec = LocalisationSpec();
+  const nssm::Model model = *nssm::Model::Create(spec);
+  const nssm::LossSpec loss{.horizon = 1, .rollout = nssm::RolloutMode::kState};
+  const nssm::LossShape shape = *nssm::ShapeOfLoss(spec, loss, kSamples);
+  const data::Trajectory trajectory = nssm::RandomTrajectory(spec, 2 * kSamples, 1);
+  const auto context = nssm::CutLossData<float>(spec, loss, trajectory, 0, shape);
+  const auto target = nssm::CutLossData<float>(spec, loss, trajectory, kSamples, shape);
+  const std::vector<double> initial = model.InitialParameters(1);
+  const std::vector<float> parameters(initial.begin(), initial.end());
+  const int64_t size = model.layout().size();
+
+  MetaSeconds seconds{};
+  const nn::Mask adapted = *nn::ParseMask("encoder.5-6,transition,*_decoder", model.layout());
+  const nssm::LossFunction<float> context_loss(model, loss, shape, adapted, adapted);
+  const auto scratch = context_loss.MakeScratch();
+  std::vector<float> iterates(static_cast<size_t>(size) * (kSteps + 1)), gradient(static_cast<size_t>(size));
+  std::copy(parameters.begin(), parameters.end(), iterates.begin());
+  seconds.adapt = MedianSeconds(7, [&] {
+    meta::RunInnerLoop(context_loss, context, kSteps, 1e-6, size, iterates.data(), gradient.data(), scratch);
+  });
+  const nn::Mask all(model.layout().tensors().size(), true);
+  for (const bool second_order : {true, false}) {
+    const meta::MetaGradient<float> meta(model, loss, second_order ? meta::Algorithm::kMaml : meta::Algorithm::kFirstOrderMaml,
+                                         shape, shape, all, kSteps, 1e-3);
+    meta::MetaGradient<float>::Scratch meta_scratch(meta);
+    (second_order ? seconds.maml : seconds.fomaml) = MedianSeconds(
+        5, [&] { meta.Compute(parameters.data(), context, target, gradient.data(), &meta_scratch); });
+  }
+  return seconds;
+}
+
+/// Latent 3, transition 4-16-3 with a skip, linear output: 134 parameters with the linear start that the peer leaves out.
+double SmallRolloutSeconds() {
+  nssm::ModelSpec spec{.kind = nssm::Case::kInputOutput, .input_size = 1, .output_size = 1, .state_size = 0, .latent_size = 3, .window = 1};
+  spec.transition.block = {.hidden_widths = {16}, .output_scale = 0.01};
+  spec.transition.bypass = nssm::Bypass::kSkip;
+  spec.output_decoder.bias = false;
+  const nssm::Model model = *nssm::Model::Create(spec);
+  const nssm::LossSpec loss{.horizon = nssm::LossSpec::kWholeSet, .state_weight = 0, .reconstruction_weight = 0};
+  const nssm::LossShape shape = *nssm::ShapeOfLoss(spec, loss, 4097);
+  const auto data = nssm::CutLossData<float>(spec, loss, nssm::RandomTrajectory(spec, 4097, 1), 0, shape);
+  const nn::Mask mask = *nn::ParseMask("transition,output_decoder", model.layout());
+  const nssm::LossFunction<float> function(model, loss, shape, mask, mask);
+  const auto scratch = function.MakeScratch();
+  const std::vector<double> initial = model.InitialParameters(1);
+  const std::vector<float> parameters(initial.begin(), initial.end());
+  std::vector<float> gradient(parameters.size());
+  return MedianSeconds(51, [&] { function.Gradient(parameters.data(), data, gradient.data(), scratch); });
+}
+
+double PeakRssMib() {
+  rusage usage{};
+  getrusage(RUSAGE_SELF, &usage);
+  return static_cast<double>(usage.ru_maxrss) / 1024;
+}
+
+/// The JSON that the peer prints, or null if it cannot be run.
+nlohmann::json RunPeer(const std::string& script) {
+  std::string text;
+  if (FILE* pipe = popen(("/usr/bin/python3 '" + script + "'").c_str(), "r")) {
+    std::array<char, 4096> buffer;
+    while (const size_t got = fread(buffer.data(), 1, buffer.size(), pipe)) text.append(buffer.data(), got);
+    if (pclose(pipe) != 0) text.clear();
+  }
+  nlohmann::json result;
+  return base::ParseJson(text, &result).ok() ? result["best"] : nlohmann::json();
+}
+
+int Main(const std::string& peer_script) {
+  const double ekf = EkfStepSeconds();
+  const MetaSeconds learning = LocalisationLearning();
+  const double rollout = SmallRolloutSeconds();
+  const double memory = PeakRssMib();
+  const nlohmann::json peer = peer_script.empty() ? nlohmann::json() : RunPeer(peer_script);
+  if (!peer_script.empty() && peer.is_null()) std::fprintf(stderr, "the peer could not be run: its columns are empty\n");
+  std::printf("%-34s %12s %12s %8s\n", "", "metaekf", "peer", "ratio");
+  const auto row = [&peer](const char* name, const char* key, double value) {
+    std::printf("%-34s %12.4g", name, value);
+    if (peer.contains(key)) std::printf(" %12.4g %8.1f", peer[key].get<double>(), peer[key].get<double>() / value);
+    std::printf("\n");
+  };
+  row("EKF step, us", "ekf_step_us", ekf * 1e6);
+  row("adaptation M=10 N=80, ms", "adapt_ms", learning.adapt * 1e3);
+  row("meta-gradient, second order, ms", "maml_ms", learning.maml * 1e3);
+  row("meta-gradient, first order, ms", "fomaml_ms", learning.fomaml * 1e3);
+  row("rollout gradient, 4096 steps, ms", "rollout_grad_ms", rollout * 1e3);
+  row("peak memory, MiB", "peak_rss_mib", memory);
+  std::printf("%-34s %12.4g\n", "EKF steps per second", 1 / ekf);
+  return 0;
+}
+
+}  // namespace
+}  // namespace metaekf
+
+int main(int argc, char** argv) {
+  const bool with_peer = argc == 3 && std::string(argv[1]) == "--peer";
+  if (argc != 1 && !with_peer) {
+    std::fprintf(stderr, "usage: %s [--peer SCRIPT]\n", argv[0]);
+    return 2;
+  }
+  return metaekf::Main(with_peer ? argv[2] : "");
+}
