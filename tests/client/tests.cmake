@@ -1,0 +1,10 @@
+add_library(metaekf_fake_server STATIC client/fake_server.cc)
+target_link_libraries(metaekf_fake_server PUBLIC metaekf::proto PRIVATE metaekf_warnings)
+target_include_directories(metaekf_fake_server PUBLIC ${PROJECT_SOURCE_DIR})
+
+foreach(test client estimation)
+  metaekf_test(client/src/${test}_test.cc DEPS metaekf::client metaekf_fake_server)
+endforeach()
+foreach(test names text_proto)
+  metaekf_test(client/src/${test}_test.cc DEPS metaekf::client metaekf::proto_messages)
+endforeach()
