@@ -21,17 +21,17 @@ class AdaptationService final : public v1::AdaptationService::CallbackService {
   ServerUnaryReactor* GetAdaptation(CallbackServerContext* call,
                                     const v1::GetAdaptationRequest* request,
                                     v1::Adaptation* response) override {
-    return RunUnary(call, context_.io, server::GetAdaptation, context_, request, response);
+    return RunUnary(call, context_, server::GetAdaptation, request, response);
   }
   ServerUnaryReactor* ListAdaptations(CallbackServerContext* call,
                                       const v1::ListAdaptationsRequest* request,
                                       v1::ListAdaptationsResponse* response) override {
-    return RunUnary(call, context_.io, server::ListAdaptations, context_, request, response);
+    return RunUnary(call, context_, server::ListAdaptations, request, response);
   }
   ServerUnaryReactor* DeleteAdaptation(CallbackServerContext* call,
                                        const v1::DeleteAdaptationRequest* request,
                                        google::protobuf::Empty* response) override {
-    return RunUnary(call, context_.io, server::DeleteAdaptation, context_, request, response);
+    return RunUnary(call, context_, server::DeleteAdaptation, request, response);
   }
 
  private:

@@ -17,36 +17,36 @@ class ModelService final : public v1::ModelService::CallbackService {
 
   ServerUnaryReactor* ListModels(CallbackServerContext* call, const v1::ListModelsRequest* request,
                                  v1::ListModelsResponse* response) override {
-    return RunUnary(call, context_.io, server::ListModels, context_, request, response);
+    return RunUnary(call, context_, server::ListModels, request, response);
   }
   ServerUnaryReactor* GetModel(CallbackServerContext* call, const v1::GetModelRequest* request,
                                v1::Model* response) override {
-    return RunUnary(call, context_.io, server::GetModel, context_, request, response);
+    return RunUnary(call, context_, server::GetModel, request, response);
   }
   ServerUnaryReactor* ListModelVersions(CallbackServerContext* call,
                                         const v1::ListModelVersionsRequest* request,
                                         v1::ListModelVersionsResponse* response) override {
-    return RunUnary(call, context_.io, server::ListModelVersions, context_, request, response);
+    return RunUnary(call, context_, server::ListModelVersions, request, response);
   }
   ServerUnaryReactor* GetModelVersion(CallbackServerContext* call,
                                       const v1::GetModelVersionRequest* request,
                                       v1::ModelVersion* response) override {
-    return RunUnary(call, context_.io, server::GetModelVersion, context_, request, response);
+    return RunUnary(call, context_, server::GetModelVersion, request, response);
   }
   ServerUnaryReactor* SetModelAlias(CallbackServerContext* call,
                                     const v1::SetModelAliasRequest* request,
                                     v1::ModelAlias* response) override {
-    return RunUnary(call, context_.io, server::SetModelAlias, context_, request, response);
+    return RunUnary(call, context_, server::SetModelAlias, request, response);
   }
   ServerUnaryReactor* DeleteModelAlias(CallbackServerContext* call,
                                        const v1::DeleteModelAliasRequest* request,
                                        Empty* response) override {
-    return RunUnary(call, context_.io, server::DeleteModelAlias, context_, request, response);
+    return RunUnary(call, context_, server::DeleteModelAlias, request, response);
   }
   ServerUnaryReactor* DeleteModelVersion(CallbackServerContext* call,
                                          const v1::DeleteModelVersionRequest* request,
                                          Empty* response) override {
-    return RunUnary(call, context_.io, server::DeleteModelVersion, context_, request, response);
+    return RunUnary(call, context_, server::DeleteModelVersion, request, response);
   }
 
   grpc::ServerReadReactor<v1::ImportModelVersionRequest>* ImportModelVersion(

@@ -13,7 +13,7 @@ class ServerService final : public v1::ServerService::CallbackService {
   grpc::ServerUnaryReactor* GetServerInfo(grpc::CallbackServerContext* call,
                                           const v1::GetServerInfoRequest* request,
                                           v1::ServerInfo* response) override {
-    return RunUnary(call, context_.io, server::GetServerInfo, context_, request, response);
+    return RunUnary(call, context_, server::GetServerInfo, request, response);
   }
 
  private:

@@ -21,11 +21,11 @@ class TrainingService final : public v1::TrainingService::CallbackService {
   }
   ServerUnaryReactor* GetJob(CallbackServerContext* call, const v1::GetJobRequest* request,
                              v1::Job* response) override {
-    return RunUnary(call, context_.io, server::GetJob, context_, request, response);
+    return RunUnary(call, context_, server::GetJob, request, response);
   }
   ServerUnaryReactor* ListJobs(CallbackServerContext* call, const v1::ListJobsRequest* request,
                                v1::ListJobsResponse* response) override {
-    return RunUnary(call, context_.io, server::ListJobs, context_, request, response);
+    return RunUnary(call, context_, server::ListJobs, request, response);
   }
   grpc::ServerWriteReactor<v1::WatchJobResponse>* WatchJob(
       CallbackServerContext*, const v1::WatchJobRequest* request) override {
@@ -33,7 +33,7 @@ class TrainingService final : public v1::TrainingService::CallbackService {
   }
   ServerUnaryReactor* CancelJob(CallbackServerContext* call, const v1::CancelJobRequest* request,
                                 v1::Job* response) override {
-    return RunUnary(call, context_.io, server::CancelJob, context_, request, response);
+    return RunUnary(call, context_, server::CancelJob, request, response);
   }
 
  private:

@@ -15,8 +15,8 @@ namespace metaekf::server {
 /// Answers a call with what `work`, which returns an absl::Status, leaves in its response. Request
 /// and response live until then.
 template <class Work>
-grpc::ServerUnaryReactor* RunUnary(grpc::CallbackServerContext* call, BackgroundExecutor& executor,
-                                   Work work) {
+grpc::ServerUnaryReactor* FinishWith(grpc::CallbackServerContext* call,
+                                     BackgroundExecutor& executor, Work work) {
   grpc::ServerUnaryReactor* reactor = call->DefaultReactor();
   const bool accepted = executor.Submit([call, reactor, work = std::move(work)] {
     if (call->IsCancelled()) return reactor->Finish(grpc::Status::CANCELLED);
@@ -26,13 +26,14 @@ grpc::ServerUnaryReactor* RunUnary(grpc::CallbackServerContext* call, Background
   return reactor;
 }
 
-/// The same with a handler of this folder.
+/// Answers a call with what a handler of this folder leaves in the response.
 template <class Request, class Response>
 grpc::ServerUnaryReactor* RunUnary(grpc::CallbackServerContext* call, const ServiceContext& context,
                                    absl::Status (*handler)(const ServiceContext&, const Request&,
                                                            Response*),
                                    const Request* request, Response* response) {
-  return RunUnary(call, context.io, [=, &context] { return handler(context, *request, response); });
+  return FinishWith(call, context.io,
+                    [=, &context] { return handler(context, *request, response); });
 }
 
 }  // namespace metaekf::server

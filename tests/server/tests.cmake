@@ -3,3 +3,16 @@ metaekf_test(server/status/text_test.cc DEPS metaekf::server_status)
 foreach(test adaptations blob_store crash database jobs models names page sessions sha256 store)
   metaekf_test(server/store/${test}_test.cc DEPS metaekf::server_store)
 endforeach()
+
+metaekf_library(server_test_support
+  SOURCES server/support/client.cc server/support/tiny_models.cc
+  DEPS metaekf::core_nssm metaekf::proto_messages metaekf::server metaekf::server_convert
+    metaekf::server_store
+  PRIVATE_DEPS metaekf::proto GTest::gtest)
+target_compile_definitions(metaekf_server_test_support
+  INTERFACE METAEKFD_BINARY="$<TARGET_FILE:metaekfd>")
+add_dependencies(metaekf_server_test_support metaekfd)  # the workers of jobs
+
+foreach(test model_service training_service)
+  metaekf_test(server/handlers/${test}_test.cc DEPS metaekf::server_test_support)
+endforeach()
