@@ -12,7 +12,7 @@ namespace {
 
 struct Flags {
   client::AdaptationRequest request;
-  std::string context, method = "gradient";
+  std::string context, method;
   int64_t samples = 0;
   uint32_t steps = 0;
   double learning_rate = 0;
@@ -42,6 +42,7 @@ absl::Status Adapt(const Flags& flags, Console& console) {
                            DescribeTarget(console, {.model = request.model}));
   METAEKF_ASSIGN_OR_RETURN(const data::Trajectory context, ReadContext(flags, model));
   request.context = ToClient(context);
+  if (flags.method == "gradient") request.method = client::AdaptationMethod::kGradientDescent;
   if (flags.method == "adam") request.method = client::AdaptationMethod::kAdam;
   if (flags.method == "from-scratch") request.method = client::AdaptationMethod::kFromScratch;
   if (flags.steps > 0) request.inner_loop.steps = flags.steps;
@@ -76,8 +77,8 @@ void AddAdapt(CLI::App& app, Console& console, Command& chosen) {
                       "Id of the adaptation (default: chosen by the server)");
   command
       ->add_option("--method", flags->method,
-                   "gradient (the inner loop, default), adam, or from-scratch (the baseline "
-                   "without meta-learning)")
+                   "gradient (the inner loop), adam, or from-scratch (the baseline without "
+                   "meta-learning); default: what the model was trained for")
       ->check(CLI::IsMember({"gradient", "adam", "from-scratch"}));
   command->add_option("--inner-steps", flags->steps, "Steps (default: the model's)")
       ->check(CLI::PositiveNumber);

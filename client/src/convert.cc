@@ -236,8 +236,9 @@ void ToProto(const InnerLoop& inner_loop, v1::InnerLoopSpec* message) {
   message->set_adapted_mask(inner_loop.adapted_mask);
 }
 
-v1::Adaptation::Method ToProto(AdaptationMethod method) {
-  switch (method) {
+v1::Adaptation::Method ToProto(std::optional<AdaptationMethod> method) {
+  if (!method) return v1::Adaptation::METHOD_UNSPECIFIED;
+  switch (*method) {
     case AdaptationMethod::kAdam:
       return v1::Adaptation::ADAM;
     case AdaptationMethod::kFromScratch:

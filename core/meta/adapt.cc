@@ -125,6 +125,31 @@ TailErrors ArxErrors(const Trajectory& head, const Trajectory& tail, int64_t war
   return errors;
 }
 
+/// A context found fit for adaptation, with what is to be minimised over what.
+struct Problem {
+  nssm::LossSpec loss;
+  nn::Mask mask;
+  Trajectory context;
+};
+
+absl::StatusOr<Problem> Pose(const Bundle& bundle, const Trajectory& context, const AdaptationOptions& options) {
+  const nssm::ModelSpec& spec = bundle.model.spec();
+  METAEKF_ASSIGN_OR_RETURN(const TrainingSpec training, ReadTrainingSpec(bundle.training));
+  METAEKF_RETURN_IF_ERROR(nssm::CheckChannels(bundle, context, !spec.is_case_one()));
+  METAEKF_RETURN_IF_ERROR(CheckFinite("input", context.inputs));
+  METAEKF_RETURN_IF_ERROR(CheckFinite("output", context.outputs));
+  if (!spec.is_case_one()) METAEKF_RETURN_IF_ERROR(CheckFinite("state", context.states));
+  const int64_t needed = ContextSamplesNeeded(spec, training.loss);
+  if (context.length() < needed) {
+    return absl::FailedPreconditionError(absl::StrCat("the context is too short: ", context.length(), " samples given, ",
+                                                      needed, " needed for the model's windows"));
+  }
+  Problem problem{.loss = training.loss, .context = context};
+  METAEKF_ASSIGN_OR_RETURN(problem.mask, nn::ParseMask(options.inner_loop.adapted_mask, bundle.model.layout()));
+  if (spec.is_case_one()) problem.context.states.resize(0, context.length());
+  return problem;
+}
+
 /// Samples of the context's end that are held out.
 int64_t TailSamples(const nssm::ModelSpec& model, int64_t samples) {
   return std::max<int64_t>(samples / 5, model.warmup() + 1);
@@ -159,37 +184,34 @@ int64_t ContextSamplesNeeded(const nssm::ModelSpec& model, const nssm::LossSpec&
   return nssm::SamplesNeeded(model, loss) + model.warmup() + 1;
 }
 
+absl::StatusOr<std::vector<double>> AdaptedParameters(const Bundle& bundle, const Trajectory& context,
+                                                      const AdaptationOptions& options) {
+  METAEKF_ASSIGN_OR_RETURN(const Problem problem, Pose(bundle, context, options));
+  METAEKF_ASSIGN_OR_RETURN(FitResult fit,
+                           FitAnyPrecision(bundle, problem.loss, problem.context, problem.mask, options, nullptr));
+  return std::move(fit.parameters);
+}
+
 absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& context,
                                        const AdaptationOptions& options, const OnStep& on_step) {
   const nssm::ModelSpec& spec = bundle.model.spec();
-  METAEKF_ASSIGN_OR_RETURN(const TrainingSpec training, ReadTrainingSpec(bundle.training));
-  METAEKF_RETURN_IF_ERROR(nssm::CheckChannels(bundle, context, !spec.is_case_one()));
-  METAEKF_RETURN_IF_ERROR(CheckFinite("input", context.inputs));
-  METAEKF_RETURN_IF_ERROR(CheckFinite("output", context.outputs));
-  if (!spec.is_case_one()) METAEKF_RETURN_IF_ERROR(CheckFinite("state", context.states));
-  const int64_t needed = ContextSamplesNeeded(spec, training.loss);
-  if (context.length() < needed) {
-    return absl::FailedPreconditionError(absl::StrCat("the context is too short: ", context.length(), " samples given, ",
-                                                      needed, " needed for the model's windows"));
-  }
+  METAEKF_ASSIGN_OR_RETURN(const Problem problem, Pose(bundle, context, options));
   AdaptationResult result;
-  METAEKF_ASSIGN_OR_RETURN(result.mask, nn::ParseMask(options.inner_loop.adapted_mask, bundle.model.layout()));
+  result.mask = problem.mask;
   result.context_samples = context.length();
   result.tail_samples = TailSamples(spec, context.length());
-  Trajectory usable = context;
-  if (spec.is_case_one()) usable.states.resize(0, context.length());
   const Eigen::Index held_out_from = context.length() - result.tail_samples;
-  METAEKF_ASSIGN_OR_RETURN(const Trajectory head, data::FirstSamples(usable, held_out_from));
-  METAEKF_ASSIGN_OR_RETURN(const Trajectory tail, data::SamplesFrom(usable, held_out_from));
+  METAEKF_ASSIGN_OR_RETURN(const Trajectory head, data::FirstSamples(problem.context, held_out_from));
+  METAEKF_ASSIGN_OR_RETURN(const Trajectory tail, data::SamplesFrom(problem.context, held_out_from));
 
   Bundle adapted = bundle;
   METAEKF_ASSIGN_OR_RETURN(result.before, ErrorsOf(bundle, tail));
-  METAEKF_ASSIGN_OR_RETURN(FitResult trial, FitAnyPrecision(bundle, training.loss, head, result.mask, options, nullptr));
+  METAEKF_ASSIGN_OR_RETURN(FitResult trial, FitAnyPrecision(bundle, problem.loss, head, problem.mask, options, nullptr));
   adapted.parameters = std::move(trial.parameters);
   METAEKF_ASSIGN_OR_RETURN(result.after, ErrorsOf(adapted, tail));
   result.arx = ArxErrors(head, tail, spec.warmup());
 
-  METAEKF_ASSIGN_OR_RETURN(FitResult fit, FitAnyPrecision(bundle, training.loss, usable, result.mask, options, on_step));
+  METAEKF_ASSIGN_OR_RETURN(FitResult fit, FitAnyPrecision(bundle, problem.loss, problem.context, problem.mask, options, on_step));
   result.parameters = std::move(fit.parameters);
   result.context_loss_before = fit.loss_before;
   result.context_loss_after = fit.loss_after;

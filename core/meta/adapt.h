@@ -46,6 +46,10 @@ struct AdaptationResult {
   TailErrors before, after, arx;
 };
 
+/// The adaptation alone: ω_M from the whole context, without errors on a tail. Arguments and errors as those of Adapt.
+absl::StatusOr<std::vector<double>> AdaptedParameters(const nssm::Bundle& bundle, const data::Trajectory& context,
+                                                      const AdaptationOptions& options);
+
 /// Samples that an adaptation needs: enough for the loss on the head of the context and for predictions on its tail.
 int64_t ContextSamplesNeeded(const nssm::ModelSpec& model, const nssm::LossSpec& loss);
 

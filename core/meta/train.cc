@@ -29,6 +29,7 @@ using nssm::ModelSpec;
 using OnStep = std::function<bool(const TrainingProgress&)>;
 
 constexpr int kValidationDraws = 2;       // context and target sets per held-out system
+constexpr size_t kNoiseSystems = 8;    // systems whose residuals give the default covariances, at most
 constexpr double kTrainingLossWeight = 0.1;  // of the newest step in the running mean
 
 /// Takes what the spec leaves open from the data, and refuses data that does not fit it.
@@ -236,19 +237,22 @@ TrainingState InitialState(const nssm::Model& model, uint64_t seed) {
   return state;
 }
 
-/// Default Q, R and P₀ from the residuals of the model adapted to each held-out system.
+/// Default Q, R and P₀ from the residuals of the model adapted to each of `systems`.
 absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(const Bundle& bundle, const TrainingSpec& spec,
-                                                       const std::vector<Trajectory>& systems) {
-  filter::NoiseEstimate noise(bundle.model);
-  for (const Trajectory& system : systems) {
-    METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, system));
-    const int64_t samples = std::min<int64_t>(
-        system.length(), std::max<int64_t>(spec.context_samples, ContextSamplesNeeded(spec.model, spec.loss)));
-    METAEKF_ASSIGN_OR_RETURN(const Trajectory context, data::FirstSamples(system, samples));
-    METAEKF_ASSIGN_OR_RETURN(const AdaptationOptions options, DefaultAdaptation(bundle));
-    const absl::StatusOr<AdaptationResult> adapted = Adapt(bundle, context, options, nullptr);
+                                                       const std::vector<Trajectory>& systems, base::Executor* executor) {
+  METAEKF_ASSIGN_OR_RETURN(const AdaptationOptions options, DefaultAdaptation(bundle));
+  const int64_t wanted = std::max<int64_t>(spec.context_samples, ContextSamplesNeeded(spec.model, spec.loss));
+  std::vector<std::vector<double>> parameters(systems.size());
+  executor->ParallelFor(systems.size(), [&](size_t i, size_t) {
+    const absl::StatusOr<Trajectory> context = data::FirstSamples(systems[i], std::min<int64_t>(systems[i].length(), wanted));
+    absl::StatusOr<std::vector<double>> adapted = AdaptedParameters(bundle, *context, options);
     // An adaptation that diverges says nothing about noise; the unadapted model stands in.
-    noise.Add(adapted.ok() ? adapted->parameters : bundle.parameters, normalised);
+    parameters[i] = adapted.ok() ? *std::move(adapted) : bundle.parameters;
+  });
+  filter::NoiseEstimate noise(bundle.model);
+  for (size_t i = 0; i < systems.size(); ++i) {
+    METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, systems[i]));
+    noise.Add(parameters[i], normalised);
   }
   return noise.Result(bundle.normaliser);
 }
@@ -303,8 +307,9 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
   bundle.training = ToJson(spec);
   bundle.provenance = {{"systems", fleet.trajectories.size()}, {"iterations", state.iteration}};
   if (!systems.validation.empty()) bundle.provenance["validation_loss"] = state.best_validation_loss;
-  METAEKF_ASSIGN_OR_RETURN(
-      bundle.noise, NoiseOfAdaptedModels(bundle, spec, Pick(used.trajectories, systems.validation.empty() ? split.training : split.validation)));
+  std::vector<size_t> judges = systems.validation.empty() ? split.training : split.validation;
+  if (judges.size() > kNoiseSystems) judges.resize(kNoiseSystems);
+  METAEKF_ASSIGN_OR_RETURN(bundle.noise, NoiseOfAdaptedModels(bundle, spec, Pick(used.trajectories, judges), executor));
   return bundle;
 }
 

@@ -1,6 +1,7 @@
 #include "server/convert/adaptations.h"
 
 #include <cmath>
+#include <optional>
 
 #include "absl/strings/str_cat.h"
 #include "core/base/numbers.h"
@@ -18,9 +19,11 @@ using meta::AdaptationMethod;
 
 constexpr uint32_t kMaxSteps = 100'000;
 
-absl::StatusOr<AdaptationMethod> ToCore(v1::Adaptation::Method method) {
+/// Nothing: the method that the model was trained for.
+absl::StatusOr<std::optional<AdaptationMethod>> ToCore(v1::Adaptation::Method method) {
   switch (method) {
     case v1::Adaptation::METHOD_UNSPECIFIED:
+      return std::nullopt;
     case v1::Adaptation::GRADIENT_DESCENT:
       return AdaptationMethod::kGradientDescent;
     case v1::Adaptation::ADAM:
@@ -56,8 +59,8 @@ v1::HeldOutErrors::Rmse ToMessage(const meta::TailErrors& errors) {
 
 absl::StatusOr<meta::AdaptationOptions> ResolveOptions(const v1::AdaptRequest::Options& request,
                                                        const nssm::Bundle& bundle) {
-  METAEKF_ASSIGN_OR_RETURN(meta::AdaptationOptions options, meta::DefaultAdaptation(bundle));
-  METAEKF_ASSIGN_OR_RETURN(options.method, ToCore(request.method()));
+  METAEKF_ASSIGN_OR_RETURN(const std::optional<AdaptationMethod> method, ToCore(request.method()));
+  METAEKF_ASSIGN_OR_RETURN(meta::AdaptationOptions options, meta::DefaultAdaptation(bundle, method));
   options.seed = request.seed();
   const std::string field = "options.inner_loop";
   const v1::InnerLoopSpec& inner_loop = request.inner_loop();

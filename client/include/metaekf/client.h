@@ -180,8 +180,8 @@ struct InnerLoop {
 struct AdaptationRequest {
   std::string model;
   std::string adaptation_id;  ///< empty: the server chooses one
-  AdaptationMethod method = AdaptationMethod::kGradientDescent;
-  InnerLoop inner_loop;  ///< what is left out is the model's
+  std::optional<AdaptationMethod> method;  ///< none: what the model was trained for
+  InnerLoop inner_loop;                    ///< what is left out is the model's
   uint64_t seed = 0;
   Trajectory context;
   std::string request_id;
