@@ -1,0 +1,39 @@
+#include "client/cli/estimate_rows.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+
+namespace metaekf::cli {
+namespace {
+
+const double kNaN = std::nan("");
+
+TEST(EstimateRowsTest, TheHeaderNamesStatesOrOutputs) {
+  // The contract's columns.
+  EXPECT_EQ(EstimateHeader({{"x1", ""}, {"x2", ""}}, true), "t,x1,x2,sx1,sx2,nis,health,flags\n");
+  EXPECT_EQ(EstimateHeader({{"y1", "m"}}, false), "t,y1_hat,sy1,nis,health,flags\n");
+}
+
+TEST(EstimateRowsTest, RowsReadBackExactlyAndLeaveOutWhatIsNotThere) {
+  client::EstimateBatch batch{.samples = 2,
+                              .times_s = {0.1, 0.2},
+                              .means = {1.0 / 3, -2, kNaN, kNaN},
+                              .covariances = {4, 0.25, kNaN, kNaN},
+                              .nis = {1e-300, kNaN},
+                              .health = {client::Health::kConsistent, client::Health::kWarmingUp},
+                              .flags = {0, client::kMissing | client::kReset}};
+  // Deviations are roots of the variances.
+  EXPECT_EQ(EstimateRow(batch, 0), "0.1,0.3333333333333333,-2,2,0.5,1e-300,consistent,\n");
+  EXPECT_EQ(EstimateRow(batch, 1), "0.2,,,,,,warming_up,missing|reset\n");
+}
+
+TEST(EstimateRowsTest, WordsAreThoseOfTheContract) {
+  EXPECT_EQ(FlagWords(63), "missing|gated|projected|delayed|reset|adapted");
+  EXPECT_EQ(FlagWords(0), "");
+  EXPECT_STREQ(HealthWord(client::Health::kInconsistent), "inconsistent");
+  EXPECT_STREQ(HealthWord(client::Health::kDiverged), "diverged");
+}
+
+}  // namespace
+}  // namespace metaekf::cli

@@ -1,0 +1,105 @@
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include <algorithm>
+
+#include "tests/client/fake_server.h"
+#include "tests/client/run.h"
+
+namespace metaekf::testing {
+namespace {
+
+using ::testing::AllOf;
+using ::testing::HasSubstr;
+
+constexpr char kHeader[] = "t,y1_hat,sy1,nis,health,flags\n";
+
+class EstimateTest : public ::testing::Test {
+ protected:
+  Outcome Run(std::vector<std::string> arguments, const std::string& input = "") {
+    arguments.insert(arguments.begin(),
+                     {"estimate", "--model", "vdp", "--server", server_.address()});
+    return RunMetaekf(arguments, input);
+  }
+  FakeServer server_;
+};
+
+TEST_F(EstimateTest, StreamsStandardInputRowByRow) {
+  const Outcome outcome = Run({}, "t,u1,y1\n1,0,10\n1.5,0,\n2,0,nan\n2.5,0,40\n");
+  ASSERT_EQ(outcome.status, 0) << outcome.err;
+  // The fake repeats y with variance 0.25 and NIS 1.5.
+  EXPECT_EQ(outcome.out, std::string(kHeader) +
+                             "1,10,0.5,1.5,consistent,\n"
+                             "1.5,10,0.5,,consistent,missing\n"
+                             "2,10,0.5,,consistent,missing\n"
+                             "2.5,40,0.5,1.5,consistent,\n");
+  EXPECT_EQ(server_.estimation.batches.size(), 4U);
+  EXPECT_EQ(server_.estimation.open.covariance_format(), v1::OpenSession::DIAGONAL);
+}
+
+TEST_F(EstimateTest, AFileIsSentInBatchesAndItsEstimatesWritten) {
+  std::string text = "u1,y1\n";
+  for (int i = 0; i < 1000; ++i) text += "0," + std::to_string(i) + "\n";
+  const std::string out = TempPath("out.csv");
+  const Outcome outcome = Run({"--data", TempFile("in.csv", text), "--out", out});
+  ASSERT_EQ(outcome.status, 0) << outcome.err;
+  const std::string written = Contents(out);
+  EXPECT_EQ(std::count(written.begin(), written.end(), '\n'), 1001);
+  EXPECT_TRUE(written.ends_with("\n499.5,999,0.5,1.5,consistent,\n"));  // 999 periods of 0.5 s
+  EXPECT_EQ(server_.estimation.batches.size(), 16U);                    // of 64 samples
+  EXPECT_THAT(outcome.out, AllOf(HasSubstr("1000"), HasSubstr("consistent")));
+}
+
+TEST_F(EstimateTest, PlotsEstimatesWithTheirBandAndTheTruth) {
+  const std::string plot = TempPath("plot.svg");
+  ASSERT_EQ(Run({"--plot", plot}, "u1,y1\n0,1\n0,2\n0,3\n").status, 0);
+  EXPECT_THAT(Contents(plot), AllOf(HasSubstr("±2σ"), HasSubstr("measured"), HasSubstr("y1 (m)")));
+
+  server_.models.version.mutable_spec()->mutable_model()->set_case_(
+      v1::ModelSpec::STATE_INPUT_OUTPUT);
+  server_.estimation.estimated.set_name("x1");
+  const Outcome outcome = Run({"--plot", plot}, "u1,y1,x1\n0,1,5\n0,2,6\n");
+  ASSERT_EQ(outcome.status, 0) << outcome.err;
+  EXPECT_THAT(outcome.out, HasSubstr("t,x1,sx1,nis,health,flags\n"));
+  EXPECT_THAT(Contents(plot), AllOf(HasSubstr("recorded"), HasSubstr("x1 (m)")));
+}
+
+TEST_F(EstimateTest, NoiseComesFromAFile) {
+  const std::string noise = TempFile("noise.textproto", "process_noise_cov: [2, 3]");
+  ASSERT_EQ(Run({"--noise", noise}, "u1,y1\n0,1\n").status, 0);
+  EXPECT_EQ(server_.estimation.open.noise().process_noise_cov(1), 3);
+  const Outcome wrong = Run({"--noise", TempFile("wrong.textproto", "q: 1")}, "u1,y1\n0,1\n");
+  EXPECT_EQ(wrong.status, 1);
+  EXPECT_THAT(wrong.err, AllOf(HasSubstr("wrong.textproto:1:"), HasSubstr("initial_mean")));
+}
+
+TEST_F(EstimateTest, AWrongRowEndsTheStreamAfterTheRowsBeforeIt) {
+  const Outcome outcome = Run({}, "u1,y1\n0,1\n0,many\n0,3\n");
+  EXPECT_EQ(outcome.status, 1);
+  EXPECT_EQ(outcome.out, std::string(kHeader) + "0,1,0.5,1.5,consistent,\n");
+  EXPECT_THAT(outcome.err, AllOf(HasSubstr("standard input:3"), HasSubstr("many")));
+}
+
+TEST_F(EstimateTest, OneFilterFollowsOneSystem) {
+  const Outcome outcome = Run({}, "trajectory,u1,y1\na,0,1\nb,0,2\n");
+  EXPECT_EQ(outcome.status, 1);
+  EXPECT_THAT(outcome.err, HasSubstr("trajectory \"b\""));
+}
+
+TEST_F(EstimateTest, MistakesInTheFileAreFoundBeforeASessionIsOpened) {
+  EXPECT_THAT(Run({"--data", "/no/such.csv"}).err, HasSubstr("/no/such.csv"));
+  EXPECT_THAT(Run({}, "u,y\n0,1\n").err,
+              AllOf(HasSubstr("no column \"u1\""), HasSubstr("--inputs")));
+  EXPECT_EQ(server_.estimation.epoch, 0U);
+}
+
+TEST_F(EstimateTest, AServerThatStopsIsAFailureAfterWhatCame) {
+  server_.estimation.stop_after_batches = 1;
+  const Outcome outcome = Run({}, "u1,y1\n0,1\n0,2\n0,3\n");
+  EXPECT_EQ(outcome.status, 1);
+  EXPECT_EQ(outcome.out, std::string(kHeader) + "0,1,0.5,1.5,consistent,\n");
+  EXPECT_THAT(outcome.err, HasSubstr("the server stops"));
+}
+
+}  // namespace
+}  // namespace metaekf::testing
