@@ -1,6 +1,7 @@
 #include <signal.h>
 #include <spdlog/sinks/stdout_color_sinks.h>
 #include <spdlog/spdlog.h>
+#include <stdlib.h>
 
 #include <CLI/CLI.hpp>
 #include <iostream>
@@ -55,6 +56,8 @@ int Serve(const Flags& flags) {
         "where to keep the data is not said: give --data-dir DIR, or data_directory in the "
         "configuration"));
   }
+  // gRPC's own log repeats errors that are reported here, in many more words.
+  setenv("GRPC_VERBOSITY", "NONE", /*overwrite=*/0);
   const sigset_t stop_signals = BlockStopSignals();
   auto server = metaekf::server::Server::Start(options);
   if (!server.ok()) return Fail(server.status());

@@ -1,0 +1,170 @@
+// kill -9 of the server at seeded moments of training, adaptation and upload: it starts again,
+// every model listed loads, nothing half made is listed, and the job goes on.
+
+#include <chrono>
+#include <thread>
+
+#include "core/base/rng.h"
+#include "tests/server/support/server_process.h"
+#include "tests/server/support/server_test.h"
+#include "tests/server/support/tiny_models.h"
+
+namespace metaekf::server {
+namespace {
+
+using ::testing::IsEmpty;
+using ::testing::SizeIs;
+
+constexpr int kRounds = 20;
+
+class KillTest : public testing::Test {
+ protected:
+  /// Starts a server, lets `work` run against it, and kills it after `delay`.
+  void KillDuring(std::chrono::microseconds delay, const std::function<void(Client&)>& work) {
+    ServerProcess server(directory_.path(), config_);
+    ASSERT_NE(server.address(), "") << "the server did not start";
+    Client client(server.address());
+    ASSERT_EQ(client.Health(), "SERVING");
+    std::thread worker([&] { work(client); });
+    // The moment of death is what varies here, so there is no event to wait for.
+    std::this_thread::sleep_for(delay);
+    EXPECT_EQ(server.End(SIGKILL).signal, SIGKILL);
+    worker.join();
+  }
+
+  /// Everything that is listed is whole: files match their digests, models load and predict.
+  void CheckEverything(Client& client) {
+    v1::GetServerInfoRequest verify;
+    verify.set_verify_files(true);
+    const auto info = client.Call(verify);
+    ASSERT_TRUE(info.ok()) << info;
+    EXPECT_THAT(info.value.data_directory().problems(), IsEmpty());
+    const auto models = client.Call(v1::ListModelsRequest());
+    for (const v1::Model& model : models.value.models()) {
+      v1::ListModelVersionsRequest list;
+      list.set_parent(model.name());
+      list.set_page_size(1000);
+      const auto versions = client.Call(list);
+      for (const auto& version : versions.value.model_versions()) {
+        CheckLoads(client, version.name());
+      }
+    }
+    v1::ListAdaptationsRequest list;
+    list.set_page_size(1000);
+    const auto adaptations = client.Call(list);
+    for (const auto& adaptation : adaptations.value.adaptations()) {
+      CheckLoads(client, adaptation.name());
+    }
+    EXPECT_THAT(*store::ListDirectory(directory_.path() + "/tmp"), IsEmpty());
+  }
+
+  void CheckLoads(Client& client, const std::string& target) {
+    std::vector<v1::PredictRequest> requests(2);
+    requests[0].mutable_header()->set_target(target);
+    requests[0].mutable_header()->set_mode(v1::PredictRequest::ONE_STEP);
+    *requests[1].mutable_samples() = TinyContext(10);
+    const auto reply = client.Predict(requests);
+    EXPECT_TRUE(reply.ok()) << target << ": " << reply;
+  }
+
+  void SetUp() override {
+    config_ = directory_.path() + "/../" +
+              testing::UnitTest::GetInstance()->current_test_info()->name() + ".textproto";
+    std::ofstream(config_) << "training { threads_per_job: 1 checkpoint_period_s: 0.02 }";
+  }
+  void TearDown() override { std::remove(config_.c_str()); }
+
+  store::TempDirectory directory_;
+  std::string config_;
+};
+
+TEST_F(KillTest, TrainingGoesOnAfterEachOfTwentyKills) {
+  base::Rng rng(2025);
+  uint32_t reached = 0;
+  for (int round = 0; round < kRounds && !HasFailure(); ++round) {
+    SCOPED_TRACE(round);
+    const std::chrono::microseconds delay(20'000 + rng.Index(200'000));
+    KillDuring(delay, [&](Client& client) {
+      if (round == 0) {
+        client.CreateJob(TinyJob("robot", 100'000'000));
+      } else {
+        CheckEverything(client);
+      }
+    });
+  }
+  // It is still the first job, further on than any server left it in the meantime.
+  ServerProcess server(directory_.path(), config_);
+  Client client(server.address());
+  const auto jobs = client.Call(v1::ListJobsRequest());
+  ASSERT_THAT(jobs.value.jobs(), SizeIs(1));
+  reached = jobs.value.jobs(0).progress().iteration();
+  const auto watched = client.Watch("jobs/1", [&](const v1::WatchJobResponse& response) {
+    return response.progress().iteration() <= reached || response.state() != v1::Job::RUNNING;
+  });
+  EXPECT_EQ(watched.value.back().state(), v1::Job::RUNNING) << watched.value.back().error_message();
+  EXPECT_GT(watched.value.back().progress().iteration(), reached);
+  EXPECT_EQ(server.End(SIGTERM).code, 0);
+}
+
+TEST_F(KillTest, NothingHalfMadeIsListedAfterKillsDuringUploads) {
+  base::Rng rng(2026);
+  int confirmed = 0;
+  for (int round = 0; round < kRounds && !HasFailure(); ++round) {
+    SCOPED_TRACE(round);
+    const std::chrono::microseconds delay(rng.Index(60'000));
+    KillDuring(delay, [&](Client& client) {
+      for (uint64_t seed = 1; seed < 1000; ++seed) {
+        const std::string file = nssm::WriteModelFile(TinyBundle(seed));
+        if (!client.Import(ImportRequests("robot", file, 500)).ok()) return;
+        ++confirmed;
+      }
+    });
+    ServerProcess server(directory_.path(), config_);
+    ASSERT_NE(server.address(), "");
+    Client client(server.address());
+    CheckEverything(client);
+    // What was confirmed is there; of the one under way it may not have been told.
+    const auto model = client.Call(Named<v1::GetModelRequest>("models/robot"));
+    if (confirmed > 0) {
+      EXPECT_GE(static_cast<int>(model.value.version_count()), confirmed);
+      EXPECT_LE(static_cast<int>(model.value.version_count()), confirmed + round + 1);
+    }
+    EXPECT_EQ(server.End(SIGTERM).code, 0);
+  }
+  EXPECT_GT(confirmed, 0);
+}
+
+TEST_F(KillTest, NothingHalfMadeIsListedAfterKillsDuringAdaptations) {
+  {
+    ServerProcess server(directory_.path(), config_);
+    Client client(server.address());
+    ASSERT_TRUE(client.Import(ImportRequests("robot", nssm::WriteModelFile(TinyBundle()))).ok());
+    EXPECT_EQ(server.End(SIGTERM).code, 0);
+  }
+  base::Rng rng(2027);
+  int confirmed = 0;
+  for (int round = 0; round < kRounds && !HasFailure(); ++round) {
+    SCOPED_TRACE(round);
+    const std::chrono::microseconds delay(rng.Index(60'000));
+    KillDuring(delay, [&](Client& client) {
+      std::vector<v1::AdaptRequest> requests(2);
+      requests[0].mutable_options()->set_model("models/robot");
+      *requests[1].mutable_samples() = TinyContext(60);
+      while (client.Adapt(requests).ok()) ++confirmed;
+    });
+    ServerProcess server(directory_.path(), config_);
+    ASSERT_NE(server.address(), "");
+    Client client(server.address());
+    CheckEverything(client);
+    v1::ListAdaptationsRequest list;
+    list.set_page_size(1000);
+    const int listed = client.Call(list).value.adaptations_size();
+    EXPECT_GE(listed, confirmed);
+    EXPECT_LE(listed, confirmed + round + 1);
+    EXPECT_EQ(server.End(SIGTERM).code, 0);
+  }
+  EXPECT_GT(confirmed, 0);
+}
+
+}  // namespace
+}  // namespace metaekf::server

@@ -1,0 +1,344 @@
+#include <grpcpp/grpcpp.h>
+
+#include <cmath>
+#include <limits>
+
+#include "core/base/rng.h"
+#include "core/filter/ekf.h"
+#include "metaekf/v1/estimation.grpc.pb.h"
+#include "tests/server/support/server_test.h"
+#include "tests/server/support/tiny_models.h"
+
+namespace metaekf::server {
+namespace {
+
+constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
+
+using Stream = grpc::ClientReaderWriter<v1::EstimateRequest, v1::EstimateResponse>;
+
+/// A recording with missing values: one input, one output.
+struct Recording {
+  std::vector<double> inputs, outputs;
+};
+
+Recording MakeRecording(int samples, double missing_share) {
+  base::Rng rng(4);
+  Recording recording;
+  double y = 0;
+  for (int t = 0; t < samples; ++t) {
+    const double u = rng.Normal();
+    recording.inputs.push_back(u);
+    recording.outputs.push_back(rng.Uniform() < missing_share ? kNaN : y + 0.01 * rng.Normal());
+    y = 0.8 * y + 0.3 * u;
+  }
+  return recording;
+}
+
+/// All estimates of a session, one value after the other: mean, covariance and NIS of every sample.
+using Estimates = std::vector<double>;
+
+class EstimationServiceTest : public ServerTest {
+ protected:
+  void SetUp() override {
+    ServerTest::SetUp();
+    Connect();
+    bundle_ = TinyStateBundle();
+    Import("tiny", *bundle_);
+  }
+
+  void Connect() {
+    stub_ = v1::EstimationService::NewStub(grpc::CreateChannel(server_->address(), grpc::InsecureChannelCredentials()));
+  }
+
+  /// A stream with its first request written.
+  struct Call {
+    std::unique_ptr<grpc::ClientContext> context = std::make_unique<grpc::ClientContext>();
+    std::unique_ptr<Stream> stream;
+  };
+
+  Call Start(const v1::EstimateRequest& first) {
+    Call call;
+    call.context->set_deadline(std::chrono::system_clock::now() + std::chrono::minutes(1));
+    call.stream = stub_->Estimate(call.context.get());
+    call.stream->Write(first);
+    return call;
+  }
+
+  static v1::EstimateRequest OpenRequest(const std::string& target = "models/tiny") {
+    v1::EstimateRequest request;
+    request.mutable_open()->set_target(target);
+    request.mutable_open()->set_covariance_format(v1::OpenSession::LOWER_TRIANGLE);
+    return request;
+  }
+
+  static v1::EstimateRequest ResumeRequest(const v1::SessionOpened& opened) {
+    v1::EstimateRequest request;
+    request.mutable_resume()->set_session(opened.session());
+    request.mutable_resume()->set_token(opened.token());
+    return request;
+  }
+
+  static v1::EstimateRequest Batch(const Recording& recording, uint64_t first_seq, size_t count) {
+    v1::EstimateRequest request;
+    v1::SampleBatch* batch = request.mutable_samples();
+    batch->set_first_seq(first_seq);
+    for (size_t t = first_seq - 1; t < std::min(first_seq - 1 + count, recording.inputs.size()); ++t) {
+      batch->add_inputs(recording.inputs[t]);
+      batch->add_outputs(recording.outputs[t]);
+    }
+    return request;
+  }
+
+  static v1::SessionOpened ReadOpened(Call& call) {
+    v1::EstimateResponse response;
+    EXPECT_TRUE(call.stream->Read(&response)) << call.stream->Finish().error_message();
+    return response.opened();
+  }
+
+  static void Append(const v1::EstimateBatch& batch, Estimates* estimates) {
+    const int rows = batch.nis_size();
+    const int n = rows > 0 ? batch.means_size() / rows : 0, triangle = rows > 0 ? batch.covariances_size() / rows : 0;
+    for (int row = 0; row < rows; ++row) {
+      for (int i = 0; i < n; ++i) estimates->push_back(batch.means(row * n + i));
+      for (int i = 0; i < triangle; ++i) estimates->push_back(batch.covariances(row * triangle + i));
+      estimates->push_back(batch.nis(row));
+    }
+  }
+
+  /// Sends samples first_seq … last and collects what comes back.
+  static Estimates Run(Call& call, const Recording& recording, uint64_t first_seq, size_t last, size_t per_message) {
+    Estimates estimates;
+    v1::EstimateResponse response;
+    for (uint64_t seq = first_seq; seq <= last; seq += per_message) {
+      call.stream->Write(Batch(recording, seq, std::min(per_message, last - seq + 1)));
+      EXPECT_TRUE(call.stream->Read(&response)) << call.stream->Finish().error_message();
+      EXPECT_EQ(response.estimates().first_seq(), seq);
+      Append(response.estimates(), &estimates);
+    }
+    return estimates;
+  }
+
+  static grpc::Status End(Call& call) {
+    call.stream->WritesDone();
+    v1::EstimateResponse response;
+    while (call.stream->Read(&response)) continue;
+    return call.stream->Finish();
+  }
+
+  /// What the filter says that is called directly.
+  Estimates Direct(const Recording& recording) const {
+    const std::shared_ptr<filter::FilterModel> model = filter::FilterModel::Create(bundle_->model);
+    filter::Ekf ekf = *filter::Ekf::Create(*bundle_, model, model->Prepare(bundle_->parameters), {});
+    const auto scratch = model->MakeScratch();
+    filter::Estimate estimate = ekf.MakeEstimate();
+    Estimates estimates;
+    for (size_t t = 0; t < recording.inputs.size(); ++t) {
+      EXPECT_TRUE(ekf.Step(Eigen::VectorXd::Constant(1, recording.inputs[t]),
+                           Eigen::VectorXd::Constant(1, recording.outputs[t]), scratch.get(), &estimate).ok());
+      for (const double value : estimate.mean) estimates.push_back(value);
+      for (Eigen::Index i = 0; i < estimate.cov.rows(); ++i) {
+        for (Eigen::Index j = 0; j <= i; ++j) estimates.push_back(estimate.cov(i, j));
+      }
+      estimates.push_back(estimate.nis);
+    }
+    return estimates;
+  }
+
+  static void ExpectIdentical(const Estimates& a, const Estimates& b) {
+    ASSERT_EQ(a.size(), b.size());
+    for (size_t i = 0; i < a.size(); ++i) {
+      ASSERT_TRUE(a[i] == b[i] || (std::isnan(a[i]) && std::isnan(b[i]))) << "value " << i << ": " << a[i] << ", " << b[i];
+    }
+  }
+
+  std::optional<nssm::Bundle> bundle_;
+  std::unique_ptr<v1::EstimationService::Stub> stub_;
+};
+
+TEST_F(EstimationServiceTest, TheStreamEqualsTheFilterBitForBit) {
+  const Recording recording = MakeRecording(10000, 0.05);
+  const Estimates direct = Direct(recording);
+  for (const size_t per_message : {size_t{1}, size_t{64}, size_t{10000}}) {
+    Call call = Start(OpenRequest());
+    ReadOpened(call);
+    ExpectIdentical(Run(call, recording, 1, 10000, per_message), direct);
+    EXPECT_TRUE(End(call).ok());
+  }
+}
+
+TEST_F(EstimationServiceTest, AResumedSessionGoesOnBitForBit) {
+  const Recording recording = MakeRecording(300, 0.05);
+  const Estimates direct = Direct(recording);
+  Call call = Start(OpenRequest());
+  const v1::SessionOpened opened = ReadOpened(call);
+  EXPECT_EQ(opened.epoch(), 1u);
+  EXPECT_EQ(opened.durable_seq(), 0u);
+  Estimates estimates = Run(call, recording, 1, 120, 10);
+  call.context->TryCancel();
+  call.stream->Finish();
+
+  Call resumed = Start(ResumeRequest(opened));
+  const v1::SessionOpened again = ReadOpened(resumed);
+  EXPECT_EQ(again.epoch(), 2u);
+  EXPECT_EQ(again.durable_seq(), 120u);
+  // Samples sent twice are applied once.
+  resumed.stream->Write(Batch(recording, 101, 40));
+  v1::EstimateResponse response;
+  ASSERT_TRUE(resumed.stream->Read(&response));
+  EXPECT_EQ(response.estimates().first_seq(), 121u);
+  EXPECT_EQ(response.estimates().nis_size(), 20);
+  Append(response.estimates(), &estimates);
+  const Estimates rest = Run(resumed, recording, 141, 300, 7);
+  estimates.insert(estimates.end(), rest.begin(), rest.end());
+  ExpectIdentical(estimates, direct);
+}
+
+TEST_F(EstimationServiceTest, ARestartOfTheServerLosesNothing) {
+  const Recording recording = MakeRecording(200, 0.05);
+  Call call = Start(OpenRequest());
+  const v1::SessionOpened opened = ReadOpened(call);
+  Estimates estimates = Run(call, recording, 1, 100, 10);
+  Stop();
+  const grpc::Status drained = call.stream->Finish();
+  EXPECT_EQ(drained.error_code(), grpc::StatusCode::UNAVAILABLE) << drained.error_message();
+  ServerTest::Start();
+  Connect();
+  Call resumed = Start(ResumeRequest(opened));
+  EXPECT_EQ(ReadOpened(resumed).durable_seq(), 100u);
+  const Estimates rest = Run(resumed, recording, 101, 200, 10);
+  estimates.insert(estimates.end(), rest.begin(), rest.end());
+  ExpectIdentical(estimates, Direct(recording));
+}
+
+TEST_F(EstimationServiceTest, ResumingTakesTheSessionFromItsOldStream) {
+  const Recording recording = MakeRecording(20, 0);
+  Call first = Start(OpenRequest());
+  const v1::SessionOpened opened = ReadOpened(first);
+  Run(first, recording, 1, 5, 5);
+  Call second = Start(ResumeRequest(opened));
+  ReadOpened(second);
+  v1::EstimateResponse response;
+  EXPECT_FALSE(first.stream->Read(&response));  // ended without a further request
+  EXPECT_EQ(first.stream->Finish().error_code(), grpc::StatusCode::ABORTED);
+  Run(second, recording, 6, 20, 5);
+  EXPECT_TRUE(End(second).ok());
+}
+
+TEST_F(EstimationServiceTest, BadSamplesEndTheStreamAndChangeNothing) {
+  const Recording recording = MakeRecording(40, 0);
+  Call call = Start(OpenRequest());
+  const v1::SessionOpened opened = ReadOpened(call);
+  Estimates estimates = Run(call, recording, 1, 20, 20);
+  call.stream->WritesDone();
+  End(call);
+  struct Bad {
+    std::function<void(v1::SampleBatch*)> change;
+    grpc::StatusCode code;
+    std::string named;
+  };
+  const Bad cases[] = {
+      {[](v1::SampleBatch* b) { b->set_inputs(2, kNaN); }, grpc::StatusCode::INVALID_ARGUMENT, "samples.inputs[2]"},
+      {[](v1::SampleBatch* b) { b->set_outputs(1, HUGE_VAL); }, grpc::StatusCode::INVALID_ARGUMENT, "samples.outputs[1]"},
+      {[](v1::SampleBatch* b) { b->add_inputs(0); }, grpc::StatusCode::INVALID_ARGUMENT, "samples.inputs"},
+      {[](v1::SampleBatch* b) { b->add_times_s(0); }, grpc::StatusCode::INVALID_ARGUMENT, "samples.times_s"},
+      {[](v1::SampleBatch* b) { for (int i = 0; i < 5; ++i) b->add_times_s(1 + 0.03 * i); }, grpc::StatusCode::INVALID_ARGUMENT, "samples.times_s"},
+      {[](v1::SampleBatch* b) { b->set_first_seq(23); }, grpc::StatusCode::OUT_OF_RANGE, "expected 21"},
+      {[](v1::SampleBatch* b) { b->set_first_seq(0); }, grpc::StatusCode::INVALID_ARGUMENT, "samples.first_seq"},
+  };
+  for (const Bad& bad : cases) {
+    Call again = Start(ResumeRequest(opened));
+    ReadOpened(again);
+    v1::EstimateRequest request = Batch(recording, 21, 5);
+    bad.change(request.mutable_samples());
+    again.stream->Write(request);
+    v1::EstimateResponse response;
+    EXPECT_FALSE(again.stream->Read(&response)) << bad.named;
+    const grpc::Status status = again.stream->Finish();
+    EXPECT_EQ(status.error_code(), bad.code) << status.error_message();
+    EXPECT_NE(status.error_message().find(bad.named), std::string::npos) << status.error_message();
+  }
+  Call last = Start(ResumeRequest(opened));
+  ReadOpened(last);
+  const Estimates rest = Run(last, recording, 21, 40, 5);
+  estimates.insert(estimates.end(), rest.begin(), rest.end());
+  ExpectIdentical(estimates, Direct(recording));
+}
+
+TEST_F(EstimationServiceTest, AGapInTimeIsATimeUpdateForEachPeriod) {
+  // The same as sending a sample without measurement for every period that is missing.
+  Recording with_gaps = MakeRecording(30, 0);
+  for (const size_t t : {size_t{10}, size_t{11}, size_t{20}}) {
+    with_gaps.inputs[t] = with_gaps.inputs[t - 1];
+    with_gaps.outputs[t] = kNaN;
+  }
+  const Estimates direct = Direct(with_gaps);
+  const size_t row = direct.size() / 30;
+  Call call = Start(OpenRequest());
+  const double period = ReadOpened(call).sample_period_s();
+  v1::EstimateRequest request;
+  v1::SampleBatch* batch = request.mutable_samples();
+  batch->set_first_seq(1);
+  Estimates expected;
+  for (size_t t = 0; t < 30; ++t) {
+    if (t == 10 || t == 11 || t == 20) continue;
+    batch->add_inputs(with_gaps.inputs[t]);
+    batch->add_outputs(with_gaps.outputs[t]);
+    batch->add_times_s(7 + period * static_cast<double>(t));
+    expected.insert(expected.end(), direct.begin() + static_cast<long>(t * row), direct.begin() + static_cast<long>((t + 1) * row));
+  }
+  call.stream->Write(request);
+  v1::EstimateResponse response;
+  ASSERT_TRUE(call.stream->Read(&response));
+  Estimates estimates;
+  Append(response.estimates(), &estimates);
+  ExpectIdentical(estimates, expected);
+}
+
+TEST_F(EstimationServiceTest, WhatCannotBeOpenedIsRefused) {
+  const auto status_of = [&](const v1::EstimateRequest& first) {
+    Call call = Start(first);
+    v1::EstimateResponse response;
+    EXPECT_FALSE(call.stream->Read(&response));
+    return call.stream->Finish();
+  };
+  EXPECT_EQ(status_of(OpenRequest("models/none")).error_code(), grpc::StatusCode::NOT_FOUND);
+  EXPECT_EQ(status_of(OpenRequest("tiny")).error_code(), grpc::StatusCode::INVALID_ARGUMENT);
+  v1::EstimateRequest request = OpenRequest();
+  request.mutable_open()->mutable_noise()->add_process_noise_cov(-1);
+  EXPECT_NE(status_of(request).error_message().find("open.noise.process_noise_cov"), std::string::npos);
+  request = OpenRequest();
+  request.mutable_open()->set_max_lag_s(1);
+  EXPECT_NE(status_of(request).error_message().find("open.max_lag_s"), std::string::npos);
+  request = OpenRequest();
+  request.mutable_open()->set_sample_period_s(7);
+  EXPECT_NE(status_of(request).error_message().find("open.sample_period_s"), std::string::npos);
+  EXPECT_EQ(status_of(Batch(MakeRecording(3, 0), 1, 3)).error_code(), grpc::StatusCode::INVALID_ARGUMENT);
+  v1::SessionOpened wrong;
+  wrong.set_session("sessions/1");
+  wrong.set_token("guess");
+  EXPECT_EQ(status_of(ResumeRequest(wrong)).error_code(), grpc::StatusCode::NOT_FOUND);
+}
+
+TEST_F(EstimationServiceTest, SessionsAreListedAndDeleted) {
+  Call call = Start(OpenRequest());
+  const v1::SessionOpened opened = ReadOpened(call);
+  Run(call, MakeRecording(5, 0), 1, 5, 5);
+  grpc::ClientContext list_context, get_context, delete_context;
+  v1::ListSessionsResponse list;
+  ASSERT_TRUE(stub_->ListSessions(&list_context, {}, &list).ok());
+  ASSERT_EQ(list.sessions_size(), 1);
+  EXPECT_EQ(list.sessions(0).target(), "models/tiny/versions/1");
+  EXPECT_EQ(list.sessions(0).applied_seq(), 5u);
+  EXPECT_TRUE(list.sessions(0).streaming());
+  google::protobuf::Empty empty;
+  ASSERT_TRUE(stub_->DeleteSession(&delete_context, Named<v1::DeleteSessionRequest>(opened.session()), &empty).ok());
+  v1::EstimateResponse response;
+  EXPECT_FALSE(call.stream->Read(&response));
+  EXPECT_EQ(call.stream->Finish().error_code(), grpc::StatusCode::ABORTED);
+  v1::Session session;
+  EXPECT_EQ(stub_->GetSession(&get_context, Named<v1::GetSessionRequest>(opened.session()), &session).error_code(),
+            grpc::StatusCode::NOT_FOUND);
+}
+
+}  // namespace
+}  // namespace metaekf::server

@@ -1,0 +1,2 @@
+metaekf_test(server/session/estimation_service_test.cc
+  DEPS metaekf::server_test_support metaekf::core_filter metaekf::proto)
