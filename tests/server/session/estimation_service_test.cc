@@ -229,8 +229,7 @@ TEST_F(EstimationServiceTest, BadSamplesEndTheStreamAndChangeNothing) {
   Call call = Start(OpenRequest());
   const v1::SessionOpened opened = ReadOpened(call);
   Estimates estimates = Run(call, recording, 1, 20, 20);
-  call.stream->WritesDone();
-  End(call);
+  EXPECT_TRUE(End(call).ok());
   struct Bad {
     std::function<void(v1::SampleBatch*)> change;
     grpc::StatusCode code;
