@@ -19,9 +19,9 @@ std::string Hint(const client::Status& status) {
     return "; start one with: metaekfd --data-dir DIR --listen " + status.metadata.at("server");
   }
   if (status.code != client::Code::kNotFound) return "";
-  for (const char* collection : {"adaptations", "jobs", "models"}) {
-    if (status.message.find(std::string(collection) + "/") != std::string::npos) {
-      return absl::StrCat("; see: metaekf ", collection, " list");
+  for (const std::string kind : {"adaptation", "job", "model"}) {
+    if (status.message.find(kind) != std::string::npos) {
+      return absl::StrCat("; see: metaekf ", kind, "s list");
     }
   }
   return "";

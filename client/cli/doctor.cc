@@ -42,10 +42,12 @@ void CheckServer(const client::ServerInfo& info, Checks& checks) {
                           " damaged or missing files"),
              "restore them from a backup, or delete what they belong to");
   for (const std::string& problem : info.problems) checks.Add("stored file", false, problem, "");
-  checks.Add("models", info.models > 0,
+  const char* first_model =
+      info.models > 0 ? "" : "; train one (metaekf train) or import one (metaekf models import)";
+  checks.Add("models", true,
              absl::StrCat(info.models, " models, ", info.model_versions, " versions, ",
-                          info.adaptations, " adaptations"),
-             "train one (metaekf train --help) or import one (metaekf models import NAME FILE)");
+                          info.adaptations, " adaptations", first_model),
+             "");
   checks.Add("work", true,
              absl::StrCat(info.running_jobs, " jobs run, ", info.queued_jobs, " wait, ",
                           info.sessions, " estimation sessions"),

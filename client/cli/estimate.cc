@@ -172,8 +172,8 @@ absl::Status Estimate(const Flags& flags, Console& console) {
   }
   METAEKF_RETURN_IF_ERROR(sender.Wait());
   if (!flags.plot.empty()) {
-    METAEKF_RETURN_IF_ERROR(
-        Plot(flags.plot, model.label, model, info.estimated, history, sender.rows()));
+    METAEKF_RETURN_IF_ERROR(Plot(flags.plot, "Estimates with " + model.label, model, info.estimated,
+                                 history, sender.rows()));
   }
   if (flags.out != "-") PrintSummary(console, summary, info);
   return absl::OkStatus();

@@ -131,10 +131,10 @@ absl::Status RunPredict(const Flags& flags, Console& console) {
   if (!flags.out.empty()) {
     METAEKF_RETURN_IF_ERROR(WriteFile(flags.out, ToCsv(data, predictions, model)));
   }
-  if (csv_to_out) console.out << ToCsv(data, predictions, model);
   if (!flags.plot.empty()) {
     METAEKF_RETURN_IF_ERROR(Plot(flags, data, predictions.front(), model));
   }
+  if (csv_to_out) console.out << ToCsv(data, predictions, model);
   if (!csv_to_out) {
     PrintFigures(console, flags, data, model, Score(data.trajectories, predictions),
                  predictions.front().warmup);

@@ -21,8 +21,8 @@ namespace {
 
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 
-grpc::Status NotFound(const std::string& name) {
-  return {grpc::StatusCode::NOT_FOUND, name + " does not exist"};
+grpc::Status NotFound(const std::string& kind, const std::string& name) {
+  return {grpc::StatusCode::NOT_FOUND, "there is no " + kind + " '" + name + "'"};
 }
 
 /// An error with one detail, as the server sends it.
@@ -52,14 +52,14 @@ class ModelService : public v1::ModelService::Service {
   }
   grpc::Status GetModel(grpc::ServerContext*, const v1::GetModelRequest* request,
                         v1::Model* response) override {
-    if (request->name() != fake_.model.name()) return NotFound(request->name());
+    if (request->name() != fake_.model.name()) return NotFound("model", request->name());
     *response = fake_.model;
     return grpc::Status::OK;
   }
   grpc::Status GetModelVersion(grpc::ServerContext*, const v1::GetModelVersionRequest* request,
                                v1::ModelVersion* response) override {
     fake_.asked_version = request->name();
-    if (!request->name().starts_with(fake_.model.name())) return NotFound(request->name());
+    if (!request->name().starts_with(fake_.model.name())) return NotFound("model", request->name());
     *response = fake_.version;
     return grpc::Status::OK;
   }
@@ -135,7 +135,7 @@ class TrainingService : public v1::TrainingService::Service {
   }
   grpc::Status GetJob(grpc::ServerContext*, const v1::GetJobRequest* request,
                       v1::Job* response) override {
-    if (request->name() != fake_.job.name()) return NotFound(request->name());
+    if (request->name() != fake_.job.name()) return NotFound("job", request->name());
     *response = fake_.job;
     return grpc::Status::OK;
   }
@@ -209,7 +209,7 @@ class AdaptationService : public v1::AdaptationService::Service {
   }
   grpc::Status GetAdaptation(grpc::ServerContext*, const v1::GetAdaptationRequest* request,
                              v1::Adaptation* response) override {
-    if (request->name() != fake_.adaptation.name()) return NotFound(request->name());
+    if (request->name() != fake_.adaptation.name()) return NotFound("adaptation", request->name());
     *response = fake_.adaptation;
     return grpc::Status::OK;
   }
@@ -276,9 +276,9 @@ class EstimationService : public v1::EstimationService::Service {
     v1::EstimateRequest request;
     stream->Read(&request);
     if (request.has_open()) fake_.open = request.open();
-    if (request.open().target() == "models/gone") return NotFound("models/gone");
+    if (request.open().target() == "models/gone") return NotFound("model", "gone");
     if (request.has_resume() && request.resume().token() != "secret") {
-      return NotFound(request.resume().session());
+      return NotFound("session", request.resume().session());
     }
     stream->Write(Opened(request.has_open()));
     while (stream->Read(&request)) {

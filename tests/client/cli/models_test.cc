@@ -43,7 +43,7 @@ TEST_F(ModelsTest, AreShownWithTheirSpecification) {
 TEST_F(ModelsTest, AnUnknownModelIsAnsweredWithWhereToLook) {
   const Outcome outcome = Run({"models", "show", "vpd"});
   EXPECT_EQ(outcome.status, 1);
-  EXPECT_THAT(outcome.err, AllOf(HasSubstr("models/vpd"), HasSubstr("metaekf models list")));
+  EXPECT_THAT(outcome.err, AllOf(HasSubstr("no model"), HasSubstr("; see: metaekf models list")));
 }
 
 TEST_F(ModelsTest, AWrongNameIsAnsweredWithTheRule) {
@@ -86,7 +86,7 @@ TEST_F(ModelsTest, DoctorSaysWhatIsWrongAndWhatToDo) {
   data->add_problems("models/vdp/versions/1 is damaged");
   const Outcome outcome = Run({"doctor", "--output", "json"});
   EXPECT_EQ(outcome.status, 1);
-  EXPECT_THAT(outcome.err, HasSubstr("5 of the checks"));
+  EXPECT_THAT(outcome.err, HasSubstr("4 of the checks"));
   EXPECT_THAT(outcome.out, AllOf(HasSubstr("same version"), HasSubstr("make room"),
                                  HasSubstr("models/vdp/versions/1 is damaged"),
                                  HasSubstr("metaekf models import")));
