@@ -114,7 +114,7 @@ absl::Status ApplyConfig(const std::string& text, ServerOptions* options) {
 
 absl::Status ReadConfigFile(const std::string& path, ServerOptions* options) {
   auto text = store::ReadFile(path);
-  if (!text.ok()) return text.status();
+  METAEKF_RETURN_IF_ERROR(base::Annotate(text.status(), path));
   return base::Annotate(ApplyConfig(*text, options), path);
 }
 

@@ -60,10 +60,14 @@ v1::HeldOutErrors::Rmse ToMessage(const meta::TailErrors& errors) {
 absl::StatusOr<meta::AdaptationOptions> ResolveOptions(const v1::AdaptRequest::Options& request,
                                                        const nssm::Bundle& bundle) {
   METAEKF_ASSIGN_OR_RETURN(const std::optional<AdaptationMethod> method, ToCore(request.method()));
-  METAEKF_ASSIGN_OR_RETURN(meta::AdaptationOptions options, meta::DefaultAdaptation(bundle, method));
+  METAEKF_ASSIGN_OR_RETURN(meta::AdaptationOptions options,
+                           meta::DefaultAdaptation(bundle, method));
   options.seed = request.seed();
   const std::string field = "options.inner_loop";
   const v1::InnerLoopSpec& inner_loop = request.inner_loop();
+  if (inner_loop.optimiser() != v1::InnerLoopSpec::OPTIMISER_UNSPECIFIED) {
+    return FieldViolation(absl::StrCat(field, ".optimiser"), "say it as options.method");
+  }
   if (inner_loop.has_steps()) {
     if (inner_loop.steps() > kMaxSteps) {
       return FieldViolation(absl::StrCat(field, ".steps"),

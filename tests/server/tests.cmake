@@ -19,3 +19,16 @@ endforeach()
 metaekf_test(server/server_test.cc DEPS metaekf::server_test_support)
 metaekf_test(server/training/resume_test.cc DEPS metaekf::server_test_support)
 metaekf_test(server/fault/kill_test.cc DEPS metaekf::server_test_support metaekf::server_training)
+metaekf_test(server/main_test.cc DEPS metaekf::server_test_support metaekf::server_training)
+metaekf_test(server/names/resource_names_test.cc DEPS metaekf::server_names)
+foreach(test samples spec)
+  metaekf_test(server/convert/${test}_test.cc DEPS metaekf::server_convert)
+endforeach()
+metaekf_test(server/serving/model_cache_test.cc
+  DEPS metaekf::server_serving metaekf::server_test_support)
+metaekf_test(server/executor/background_executor_test.cc DEPS metaekf::server_executor)
+metaekf_test(server/training/job_feed_test.cc DEPS metaekf::server_training)
+metaekf_test(server/config/read_config_test.cc
+  DEPS metaekf::server_config metaekf::server_store)
+target_compile_definitions(server.config.read_config_test
+  PRIVATE METAEKF_SOURCE_DIR="${PROJECT_SOURCE_DIR}")

@@ -154,6 +154,9 @@ TEST_F(AdaptationServiceTest, WrongRequestsAreRefusedWithTheField) {
               {"options.inner_loop.steps"});
   ExpectError(options([](auto& o) { o.mutable_inner_loop()->set_adapted_mask("brain"); }), kInvalid,
               {"options.inner_loop.adapted_mask"});
+  ExpectError(
+      options([](auto& o) { o.mutable_inner_loop()->set_optimiser(v1::InnerLoopSpec::ADAM); }),
+      kInvalid, {"options.inner_loop.optimiser"});
   ExpectError(options([](auto& o) { o.set_method(static_cast<v1::Adaptation::Method>(9)); }),
               kInvalid, {"options.method"});
   ExpectError(options([](auto& o) {
