@@ -39,13 +39,11 @@ class BidiCall final : public grpc::ServerBidiReactor<Request, Response>,
   }
 
   void OnWriteDone(bool ok) override {
-    {
-      std::lock_guard lock(mutex_);
-      writing_ = false;
-      outbox_.pop_front();
-      if (!ok) outbox_.clear();
-    }
-    Advance();
+    std::unique_lock lock(mutex_);
+    writing_ = false;
+    outbox_.pop_front();
+    if (!ok) outbox_.clear();
+    Advance(std::move(lock));
   }
 
   void OnCancel() override { cancelled_ = true; }
@@ -65,20 +63,16 @@ class BidiCall final : public grpc::ServerBidiReactor<Request, Response>,
   }
 
   void EndStep(const absl::Status& status, bool last) {
-    {
-      std::lock_guard lock(mutex_);
-      step_done_ = true;
-      if (last) result_ = status;
-    }
-    Advance();
+    std::unique_lock lock(mutex_);
+    step_done_ = true;
+    if (last) result_ = status;
+    Advance(std::move(lock));
   }
 
   void Send(Response response) override {
-    {
-      std::lock_guard lock(mutex_);
-      outbox_.push_back(std::move(response));
-    }
-    Advance();
+    std::unique_lock lock(mutex_);
+    outbox_.push_back(std::move(response));
+    Advance(std::move(lock));
   }
 
   bool idle() override {
@@ -88,14 +82,11 @@ class BidiCall final : public grpc::ServerBidiReactor<Request, Response>,
 
   bool cancelled() override { return cancelled_ || context_->IsCancelled(); }
 
-  /// @param message  what kWrite is to write.
-  Action NextAction(const Response** message) {
-    std::lock_guard lock(mutex_);
+  Action NextAction() {
     if (writing_) return Action::kNone;
     if (cancelled_) outbox_.clear();
     if (!outbox_.empty()) {
       writing_ = true;
-      *message = &outbox_.front();
       return Action::kWrite;
     }
     if (!step_done_) return Action::kNone;
@@ -103,10 +94,14 @@ class BidiCall final : public grpc::ServerBidiReactor<Request, Response>,
     return result_ ? Action::kFinish : Action::kRead;
   }
 
-  /// Starts what comes next, outside the lock: once Finish is called, this may be deleted.
-  void Advance() {
-    const Response* message = nullptr;
-    switch (NextAction(&message)) {
+  /// Starts what comes next. Decided in the same critical section as what led to it, and done
+  /// outside: as soon as the lock is free, another thread may finish the call and delete this.
+  void Advance(std::unique_lock<std::mutex> lock) {
+    const Action action = NextAction();
+    if (action == Action::kNone) return;
+    const Response* message = action == Action::kWrite ? &outbox_.front() : nullptr;
+    lock.unlock();
+    switch (action) {
       case Action::kNone:
         return;
       case Action::kRead:

@@ -15,40 +15,32 @@ WatchCall::WatchCall(const ServiceContext& context, const std::string& name) : c
   }
   job_ = *job;
   subscription_ = context_.jobs.Subscribe(job_, [this](JobFeed::Event event) { OnEvent(event); });
-  {
-    std::lock_guard lock(mutex_);
-    state_ = State::kIdle;
-  }
-  Advance();
+  std::unique_lock lock(mutex_);
+  state_ = State::kIdle;
+  Advance(std::move(lock));
 }
 
 void WatchCall::OnEvent(JobFeed::Event event) {
-  {
-    std::lock_guard lock(mutex_);
-    changed_ = true;
-    if (event == JobFeed::Event::kClosed) {
-      stop_ = absl::UnavailableError("the server stops; the job goes on when it is back");
-    }
+  std::unique_lock lock(mutex_);
+  changed_ = true;
+  if (event == JobFeed::Event::kClosed) {
+    stop_ = absl::UnavailableError("the server stops; the job goes on when it is back");
   }
-  Advance();
+  Advance(std::move(lock));
 }
 
 void WatchCall::OnCancel() {
-  {
-    std::lock_guard lock(mutex_);
-    stop_ = absl::CancelledError("the call was cancelled");
-  }
-  Advance();
+  std::unique_lock lock(mutex_);
+  stop_ = absl::CancelledError("the call was cancelled");
+  Advance(std::move(lock));
 }
 
 void WatchCall::OnWriteDone(bool ok) {
-  {
-    std::lock_guard lock(mutex_);
-    state_ = State::kIdle;
-    if (ended_) stop_ = absl::OkStatus();
-    if (!ok) stop_ = absl::CancelledError("the call was cancelled");
-  }
-  Advance();
+  std::unique_lock lock(mutex_);
+  state_ = State::kIdle;
+  if (ended_) stop_ = absl::OkStatus();
+  if (!ok) stop_ = absl::CancelledError("the call was cancelled");
+  Advance(std::move(lock));
 }
 
 void WatchCall::OnDone() {
@@ -56,16 +48,12 @@ void WatchCall::OnDone() {
   delete this;
 }
 
-void WatchCall::Advance() {
-  std::optional<absl::Status> stop;
-  {
-    std::lock_guard lock(mutex_);
-    if (state_ != State::kIdle) return;
-    if (!stop_ && !changed_) return;
-    stop = stop_;
-    state_ = stop ? State::kFinished : State::kBusy;
-    changed_ = false;
-  }
+void WatchCall::Advance(std::unique_lock<std::mutex> lock) {
+  if (state_ != State::kIdle || (!stop_ && !changed_)) return;
+  const std::optional<absl::Status> stop = stop_;
+  state_ = stop ? State::kFinished : State::kBusy;
+  changed_ = false;
+  lock.unlock();
   if (stop) return Finish(ToGrpcStatus(*stop));
   if (!context_.io.Submit([this] { Look(); })) FinishWith(Overloaded());
 }
@@ -76,11 +64,9 @@ void WatchCall::Look() {
   response_ = ToWatchResponse(*job);
   std::string told = response_.SerializeAsString();
   if (told == last_told_) {
-    {
-      std::lock_guard lock(mutex_);
-      state_ = State::kIdle;
-    }
-    return Advance();
+    std::unique_lock lock(mutex_);
+    state_ = State::kIdle;
+    return Advance(std::move(lock));
   }
   last_told_ = std::move(told);
   ended_ = job->state != store::JobState::kQueued && job->state != store::JobState::kRunning;

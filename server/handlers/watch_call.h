@@ -26,8 +26,10 @@ class WatchCall final : public grpc::ServerWriteReactor<v1::WatchJobResponse> {
   enum class State { kIdle, kBusy, kFinished };
 
   void OnEvent(JobFeed::Event event);
-  /// Looks at the job on the executor, unless that or a write is under way.
-  void Advance();
+  /// Looks at the job on the executor, unless that or a write is under way. Called with the lock
+  /// under which the reason arose: once it is free, another thread may finish the call and delete
+  /// this.
+  void Advance(std::unique_lock<std::mutex> lock);
   void Look();
   void FinishWith(const absl::Status& status);
 
