@@ -2,61 +2,15 @@
 #include <cassert>
 #include <map>
 
+#include "core/autodiff/arena_allocator.h"
 #include "core/autodiff/program.h"
+#include "core/autodiff/uses.h"
 
 namespace metaekf::autodiff {
 namespace {
 
-constexpr int64_t kAlignment = 16;  // elements: 64 bytes in float, 128 in double
-
-int64_t Aligned(int64_t size) { return (size + kAlignment - 1) / kAlignment * kAlignment; }
 int64_t SizeOf(const Node& node) { return int64_t{node.rows} * node.cols; }
 
-/// Gives out places in an arena, lowest fit first.
-class ArenaAllocator {
- public:
-  int64_t Allocate(int64_t size) {
-    size = Aligned(std::max<int64_t>(size, 1));
-    for (auto it = free_.begin(); it != free_.end(); ++it) {
-      if (it->second < size) continue;
-      const int64_t offset = it->first;
-      const int64_t rest = it->second - size;
-      free_.erase(it);
-      if (rest > 0) free_[offset + size] = rest;
-      return offset;
-    }
-    const int64_t offset = end_;
-    end_ += size;
-    return offset;
-  }
-
-  void Free(int64_t offset, int64_t size) {
-    size = Aligned(std::max<int64_t>(size, 1));
-    auto next = free_.lower_bound(offset);
-    if (next != free_.begin()) {
-      auto previous = std::prev(next);
-      if (previous->first + previous->second == offset) {
-        offset = previous->first;
-        size += previous->second;
-        free_.erase(previous);
-      }
-    }
-    next = free_.lower_bound(offset);
-    if (next != free_.end() && offset + size == next->first) {
-      size += next->second;
-      free_.erase(next);
-    }
-    free_[offset] = size;
-  }
-
-  int64_t end() const { return end_; }
-
- private:
-  std::map<int64_t, int64_t> free_;  // offset → size, disjoint and never adjacent
-  int64_t end_ = 0;
-};
-
-bool IsBinaryElementwise(Op op) { return op == Op::kAdd || op == Op::kSub || op == Op::kMul; }
 bool IsView(Op op) { return op == Op::kSliceRows || op == Op::kTile || op == Op::kCollect || op == Op::kFinalCarry; }
 
 Operand Tiled(Operand operand, const Node& tile) {
@@ -64,64 +18,6 @@ Operand Tiled(Operand operand, const Node& tile) {
   operand.tile_count = tile.count;
   return operand;
 }
-
-/// Readers of each value among the needed nodes of one graph, and what the readers allow: slices are read in
-/// place by products, tiles by elementwise operations.
-struct Uses {
-  Uses(const Graph& graph, const std::vector<bool>& needed, const std::vector<bool>& kept)
-      : count(needed.size(), 0), last(needed.size(), -1), in_place(needed.size(), false), fused(needed.size(), false) {
-    std::vector<bool> only_products(needed.size(), true), only_elementwise(needed.size(), true);
-    for (Value v = 0; v < graph.size(); ++v) {
-      const size_t i = static_cast<size_t>(v);
-      if (!needed[i]) continue;
-      const Node& node = graph.node(v);
-      for (const Value input : node.inputs) {
-        const size_t j = static_cast<size_t>(input);
-        ++count[j];
-        last[j] = std::max(last[j], v);
-        only_products[j] = only_products[j] && node.op == Op::kMatMul;
-        only_elementwise[j] = only_elementwise[j] && IsBinaryElementwise(node.op) &&
-                              node.inputs[0] != node.inputs[1] && !TilesBoth(graph, node);
-      }
-    }
-    for (Value v = 0; v < graph.size(); ++v) {
-      const size_t i = static_cast<size_t>(v);
-      if (!needed[i]) continue;
-      const Node& node = graph.node(v);
-      if (node.op == Op::kSliceRows) in_place[i] = only_products[i] && !kept[i];
-      if (node.op == Op::kTile) in_place[i] = only_elementwise[i] && !kept[i];
-      if (node.op == Op::kCollect || node.op == Op::kFinalCarry) in_place[i] = true;
-    }
-    // Add(x, MatMul) becomes one instruction if nobody else wants the product.
-    for (Value v = 0; v < graph.size(); ++v) {
-      const size_t i = static_cast<size_t>(v);
-      if (!needed[i] || graph.node(v).op != Op::kAdd) continue;
-      const Value product = FusableProduct(graph, graph.node(v), kept);
-      if (product != kNoValue) fused[static_cast<size_t>(product)] = true;
-    }
-  }
-
-  static bool TilesBoth(const Graph& graph, const Node& node) {
-    return graph.node(node.inputs[0]).op == Op::kTile && graph.node(node.inputs[1]).op == Op::kTile;
-  }
-
-  /// The operand of an addition that can be accumulated onto the other one.
-  Value FusableProduct(const Graph& graph, const Node& add, const std::vector<bool>& kept) const {
-    for (const size_t which : {1, 0}) {
-      const Value candidate = add.inputs[which];
-      if (graph.node(candidate).op == Op::kMatMul && count[static_cast<size_t>(candidate)] == 1 &&
-          !kept[static_cast<size_t>(candidate)] && add.inputs[0] != add.inputs[1]) {
-        return candidate;
-      }
-    }
-    return kNoValue;
-  }
-
-  std::vector<int32_t> count;
-  std::vector<Value> last;     // the last reader
-  std::vector<bool> in_place;  // a view: no instruction of its own
-  std::vector<bool> fused;     // a product computed by the addition that reads it
-};
 
 class Compiler {
  public:
