@@ -61,15 +61,17 @@ void WatchCall::Advance(std::unique_lock<std::mutex> lock) {
 void WatchCall::Look() {
   const auto job = context_.store.jobs().Get(job_);
   if (!job.ok()) return FinishWith(job.status());
-  response_ = ToWatchResponse(*job);
-  std::string told = response_.SerializeAsString();
+  v1::WatchJobResponse response = ToWatchResponse(*job);
+  std::string told = response.SerializeAsString();
+  std::unique_lock lock(mutex_);
   if (told == last_told_) {
-    std::unique_lock lock(mutex_);
     state_ = State::kIdle;
     return Advance(std::move(lock));
   }
+  response_.Swap(&response);
   last_told_ = std::move(told);
   ended_ = job->state != store::JobState::kQueued && job->state != store::JobState::kRunning;
+  lock.unlock();
   StartWrite(&response_);
 }
 

@@ -36,11 +36,11 @@ class WatchCall final : public grpc::ServerWriteReactor<v1::WatchJobResponse> {
   const ServiceContext& context_;
   int64_t job_ = 0;
   std::optional<int64_t> subscription_;
-  v1::WatchJobResponse response_;
-  std::string last_told_;
-  bool ended_ = false;  // the job has, and the client was told
 
   std::mutex mutex_;
+  v1::WatchJobResponse response_;  // being written while busy
+  std::string last_told_;
+  bool ended_ = false;  // the job has, and the client was told
   State state_ = State::kBusy;
   bool changed_ = true;
   std::optional<absl::Status> stop_;  // why to end as soon as nothing is under way
