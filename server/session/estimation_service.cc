@@ -70,6 +70,8 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   }
 
   void OnDone() override {
+    // Whoever called Finish may still hold the mutex on another thread: it must have let go before this is deleted.
+    { std::lock_guard lock(mutex_); }
     if (live_ != nullptr) service_.sessions_.Close(live_);
     service_.Remove(this);
     delete this;
