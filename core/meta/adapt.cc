@@ -18,7 +18,7 @@ using nssm::LossData;
 using nssm::LossFunction;
 using nssm::LossShape;
 
-using OnStep = std::function<bool(int32_t, int32_t, double)>;
+using OnStep = std::function<bool(const AdaptationStep&)>;
 
 // A loss over a long context takes at most this many predicted samples at a time into memory: rollouts start further
 // apart then.
@@ -77,7 +77,7 @@ absl::StatusOr<FitResult> Fit(const Bundle& bundle, nssm::LossSpec loss, const T
                                       : function.Value(typed.data(), data, scratch);
     if (!std::isfinite(value)) return Diverged(step, value, learning_rate);
     (step == 0 ? result.loss_before : result.loss_after) = value;
-    if (step > 0 && on_step && !on_step(step, steps, value)) return absl::CancelledError("the adaptation was cancelled");
+    if (step > 0 && on_step && !on_step({.step = step, .steps = steps, .loss = value})) return absl::CancelledError("the adaptation was cancelled");
     if (step == steps) break;
     gradient.assign(typed_gradient.begin(), typed_gradient.end());
     if (options.method == AdaptationMethod::kGradientDescent) {
@@ -206,12 +206,18 @@ absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& c
 
   Bundle adapted = bundle;
   METAEKF_ASSIGN_OR_RETURN(result.before, ErrorsOf(bundle, tail));
-  METAEKF_ASSIGN_OR_RETURN(FitResult trial, FitAnyPrecision(bundle, problem.loss, head, problem.mask, options, nullptr));
+  const OnStep on_trial_step = [&](AdaptationStep step) {
+    step.trial = true;
+    return !on_step || on_step(step);
+  };
+  METAEKF_ASSIGN_OR_RETURN(FitResult trial,
+                           FitAnyPrecision(bundle, problem.loss, head, problem.mask, options, on_trial_step));
   adapted.parameters = std::move(trial.parameters);
   METAEKF_ASSIGN_OR_RETURN(result.after, ErrorsOf(adapted, tail));
   result.arx = ArxErrors(head, tail, spec.warmup());
 
-  METAEKF_ASSIGN_OR_RETURN(FitResult fit, FitAnyPrecision(bundle, problem.loss, problem.context, problem.mask, options, on_step));
+  METAEKF_ASSIGN_OR_RETURN(FitResult fit,
+                           FitAnyPrecision(bundle, problem.loss, problem.context, problem.mask, options, on_step));
   result.parameters = std::move(fit.parameters);
   result.context_loss_before = fit.loss_before;
   result.context_loss_after = fit.loss_after;

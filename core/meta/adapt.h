@@ -50,6 +50,14 @@ struct AdaptationResult {
 absl::StatusOr<std::vector<double>> AdaptedParameters(const nssm::Bundle& bundle, const data::Trajectory& context,
                                                       const AdaptationOptions& options);
 
+/// Where an adaptation stands.
+struct AdaptationStep {
+  bool trial = false;  ///< of the trial on the head of the context, whose only use is the errors on its tail
+  int32_t step = 0;    ///< done, of `steps`
+  int32_t steps = 0;
+  double loss = 0;  ///< after the step, on what is being fitted to
+};
+
 /// Samples that an adaptation needs: enough for the loss on the head of the context and for predictions on its tail.
 int64_t ContextSamplesNeeded(const nssm::ModelSpec& model, const nssm::LossSpec& loss);
 
@@ -60,11 +68,11 @@ int64_t ContextSamplesNeeded(const nssm::ModelSpec& model, const nssm::LossSpec&
 /// returned is then made from the whole context in the same way.
 ///
 /// @param context   one trajectory in physical units.
-/// @param on_step   called with (step, steps, loss) after every step of the final adaptation; false stops it.
+/// @param on_step   called after every step, first of the trial, then of the adaptation; false stops it.
 /// Errors: FailedPrecondition if the context is too short, with the number needed; InvalidArgument for channels, NaN or
 /// the mask; OutOfRange if the loss diverges, saying at which step; Cancelled if on_step said so.
 absl::StatusOr<AdaptationResult> Adapt(const nssm::Bundle& bundle, const data::Trajectory& context,
                                        const AdaptationOptions& options,
-                                       const std::function<bool(int32_t, int32_t, double)>& on_step);
+                                       const std::function<bool(const AdaptationStep&)>& on_step);
 
 }  // namespace metaekf::meta

@@ -53,8 +53,8 @@ class AdaptCall final : public StreamHandler<Request, Response> {
     const absl::Time start = absl::Now();
     METAEKF_ASSIGN_OR_RETURN(meta::AdaptationResult result,
                              meta::Adapt(model_->bundle, *context, options_,
-                                         [&](int32_t step, int32_t steps, double loss) {
-                                           SendProgress(step, steps, loss, sink);
+                                         [&](const meta::AdaptationStep& step) {
+                                           if (!step.trial) SendProgress(step, sink);
                                            return !sink.cancelled();
                                          }));
     return Store(std::move(result), id, absl::ToDoubleSeconds(absl::Now() - start), sink);
@@ -77,14 +77,14 @@ class AdaptCall final : public StreamHandler<Request, Response> {
     return absl::OkStatus();
   }
 
-  void SendProgress(int32_t step, int32_t steps, double loss, Sink& sink) {
+  void SendProgress(const meta::AdaptationStep& step, Sink& sink) {
     const absl::Time now = absl::Now();
-    if (step < steps && (now - last_progress_ < kProgressPeriod || !sink.idle())) return;
+    if (step.step < step.steps && (now - last_progress_ < kProgressPeriod || !sink.idle())) return;
     last_progress_ = now;
     Response response;
-    response.mutable_progress()->set_step(static_cast<uint32_t>(step));
-    response.mutable_progress()->set_steps(static_cast<uint32_t>(steps));
-    response.mutable_progress()->set_loss(loss);
+    response.mutable_progress()->set_step(static_cast<uint32_t>(step.step));
+    response.mutable_progress()->set_steps(static_cast<uint32_t>(step.steps));
+    response.mutable_progress()->set_loss(step.loss);
     sink.Send(std::move(response));
   }
 
