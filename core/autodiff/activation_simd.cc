@@ -4,6 +4,7 @@
 //   swish      n-th derivative z s⁽ⁿ⁾ + n s⁽ⁿ⁻¹⁾
 //   mish       z m with m = tanh ∘ softplus: z m⁽ⁿ⁾ + n m⁽ⁿ⁻¹⁾, m⁽ⁿ⁾ by Faà di Bruno
 
+#include <algorithm>
 #include <cstddef>
 
 #include "core/autodiff/activation.h"
@@ -152,11 +153,12 @@ void Map(T a, const T* HWY_RESTRICT z, T* out, size_t count) {
   for (; i + lanes <= count; i += lanes) {
     hn::StoreU(Function::template Apply<order>(d, hn::LoadU(d, z + i), parameter), d, out + i);
   }
-  if (i == count) return;
+  const size_t tail = count - i;
+  if (tail == 0) return;
   HWY_ALIGN T padded[HWY_MAX_BYTES / sizeof(T)] = {};
-  for (size_t k = i; k < count; ++k) padded[k - i] = z[k];
+  std::copy_n(z + i, tail, padded);
   hn::Store(Function::template Apply<order>(d, hn::Load(d, padded), parameter), d, padded);
-  for (size_t k = i; k < count; ++k) out[k] = padded[k - i];
+  std::copy_n(padded, tail, out + i);
 }
 
 template <class Function, typename T>
