@@ -116,13 +116,6 @@ Value ModelGraph::Output(Value latent, Value state) const {
   return physics::CurlFree(graph_, decoded, state, model_.spec_.curl_free_positions);
 }
 
-namespace {
-
-/// One step of a rollout: what is carried on, and what is predicted on the way.
-struct Step {
-  Value next, state, output;
-};
-
 Step BuildStep(const Model& model, RolloutMode mode, const ModelGraph& parts, Value carry, Value input) {
   if (mode == RolloutMode::kState) {
     const Value latent = parts.Encode(carry, input);
@@ -134,8 +127,6 @@ Step BuildStep(const Model& model, RolloutMode mode, const ModelGraph& parts, Va
   return {latent, parts.State(latent), parts.Output(carry, kNoValue)};
 }
 
-}  // namespace
-
 Value StartOfRollout(const ModelGraph& parts, RolloutMode mode, Value start, Value first_input) {
   return mode == RolloutMode::kState ? start : parts.Encode(start, first_input);
 }
@@ -144,7 +135,7 @@ Rollout BuildRollout(const Model& model, RolloutMode mode, const nn::ParameterVa
                      Value inputs, int32_t length, Graph* graph) {
   if (length == 1) {
     const Step step = BuildStep(model, mode, ModelGraph(&model, graph, parameters), carry, inputs);
-    return {step.state, step.output, step.next};
+    return {step.state, step.output, step.next, carry};
   }
   Recurrence rec;
   rec.length = length;
@@ -167,7 +158,7 @@ Rollout BuildRollout(const Model& model, RolloutMode mode, const nn::ParameterVa
   rec.carry_out.push_back(step.next);
   ScanResult result(graph, std::move(rec));
   return {step.state == kNoValue ? kNoValue : result.AtEveryStep(step.state), result.AtEveryStep(step.output),
-          result.Final(0)};
+          result.Final(0), result.AtEveryStep(body_carry)};
 }
 
 }  // namespace metaekf::nssm

@@ -69,11 +69,21 @@ class ModelGraph {
 autodiff::Value StartOfRollout(const ModelGraph& parts, RolloutMode mode, autodiff::Value start,
                                autodiff::Value first_input);
 
+/// One step of a rollout: what is carried on, and what is predicted on the way.
+struct Step {
+  autodiff::Value next = autodiff::kNoValue;    ///< the carry of the next step
+  autodiff::Value state = autodiff::kNoValue;   ///< x̂ of the next step; Case II
+  autodiff::Value output = autodiff::kNoValue;  ///< Case I: ŷ of the next step; Case II: ŷ of this one
+};
+Step BuildStep(const Model& model, RolloutMode mode, const ModelGraph& parts, autodiff::Value carry,
+               autodiff::Value input);
+
 /// Predictions over `length` steps from W starts at once. Columns: step by step, W columns each.
 struct Rollout {
   autodiff::Value states = autodiff::kNoValue;   ///< x̂_{k+1}, k = 0 … length − 1; Case II
   autodiff::Value outputs = autodiff::kNoValue;  ///< Case I: ŷ_{k+1}; Case II: ŷ_k
   autodiff::Value carry = autodiff::kNoValue;    ///< where the next rollout would go on from, W columns
+  autodiff::Value carries = autodiff::kNoValue;  ///< what each step started from
 };
 
 /// Appends a rollout to a graph.
