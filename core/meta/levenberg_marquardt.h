@@ -1,0 +1,47 @@
+#pragma once
+
+#include <Eigen/Core>
+#include <functional>
+
+namespace metaekf::meta {
+
+/// A sum of squares near one point: Φ(x + δ) ≈ cost + gradientᵀ δ + ½ δᵀ curvature δ.
+struct QuadraticModel {
+  double cost = 0;
+  Eigen::VectorXd gradient;
+  Eigen::MatrixXd curvature;  ///< symmetric, positive semidefinite; the lower triangle is read
+};
+
+/// What Levenberg–Marquardt minimises.
+struct Objective {
+  std::function<double(const Eigen::VectorXd&)> cost;  ///< may be infinite
+  std::function<void(const Eigen::VectorXd&, QuadraticModel*)> linearise;
+};
+
+struct LevenbergMarquardtOptions {
+  int max_iterations = 50;
+  double tolerance = 1e-6;       ///< ends when a step promises or brings less than this share of Φ
+  double initial_damping = 1e-3; ///< of the curvature's diagonal
+};
+
+struct LevenbergMarquardtResult {
+  Eigen::VectorXd x;
+  QuadraticModel model;  ///< at x
+  int iterations = 0;    ///< linearisations after the first
+  bool converged = false;
+  bool stopped = false;  ///< on_iteration said so
+};
+
+/// Minimises Φ by damped Gauss–Newton steps:
+///
+///   (B + μ D) δ = −g,   D = diag(B)
+///
+/// μ falls after steps that bring what the quadratic model promised and rises after those that do not
+/// (K. Madsen, H. B. Nielsen, O. Tingleff, Methods for Non-Linear Least Squares Problems, 2004, section 3.2).
+///
+/// @param on_iteration  called with (iteration, Φ) after every accepted step; false stops. May be empty.
+LevenbergMarquardtResult MinimiseLevenbergMarquardt(const Objective& objective, const Eigen::VectorXd& x,
+                                                    const LevenbergMarquardtOptions& options,
+                                                    const std::function<bool(int, double)>& on_iteration);
+
+}  // namespace metaekf::meta

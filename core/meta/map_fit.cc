@@ -1,0 +1,110 @@
+#include "core/meta/map_fit.h"
+
+#include <Eigen/Cholesky>
+#include <algorithm>
+#include <cmath>
+
+namespace metaekf::meta {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using nssm::LossData;
+using nssm::NormalEquations;
+using nssm::RolloutLeastSquares;
+
+namespace {
+
+constexpr int kNoiseRounds = 4;           // of estimating the noise and fitting again, at most
+constexpr double kNoiseConverged = 0.05;  // relative change that ends them
+
+/// σ_c² from what the fit leaves, where γ of the unknowns are determined by the data.
+VectorXd EstimateNoise(const Belief& belief, const MapFit& fit, int64_t samples, double noise_samples) {
+  const VectorXd start = belief.noise_variance;
+  // γ = tr(I − (Λ + JᵀWJ)⁻¹ Λ)
+  const double undetermined = fit.information.llt().solve(belief.precision).trace();
+  const double determined = static_cast<double>(fit.unknowns.size()) - undetermined;
+  const double used_channels = static_cast<double>((start.array() < std::numeric_limits<double>::infinity()).count());
+  const double share = determined / std::max(1.0, used_channels);  // of each channel
+  VectorXd variance = start;
+  for (Index c = 0; c < start.size(); ++c) {
+    if (!std::isfinite(start[c])) continue;
+    const double freedom = std::max(1.0, static_cast<double>(samples) - share);
+    variance[c] = (fit.channel_squares[c] + noise_samples * start[c]) / (freedom + noise_samples);
+  }
+  return variance;
+}
+
+}  // namespace
+
+void ScatterAdapted(const RolloutLeastSquares& problem, const VectorXd& unknowns, std::vector<double>* parameters) {
+  Index from = 0;
+  for (const auto& [offset, size] : problem.adapted()) {
+    std::copy_n(unknowns.data() + from, size, parameters->data() + offset);
+    from += size;
+  }
+}
+
+VectorXd GatherAdapted(const RolloutLeastSquares& problem, const std::vector<double>& parameters) {
+  VectorXd adapted(problem.adapted_size());
+  Index to = 0;
+  for (const auto& [offset, size] : problem.adapted()) {
+    std::copy_n(parameters.data() + offset, size, adapted.data() + to);
+    to += size;
+  }
+  return adapted;
+}
+
+MapFit FitMap(const RolloutLeastSquares& problem, const LossData<double>& data, const std::vector<double>& parameters,
+              const Belief& belief, const VectorXd& from, const MapFitOptions& options,
+              RolloutLeastSquares::Workspace* workspace, const std::function<bool(int, double)>& on_iteration) {
+  std::vector<double> all = parameters;
+  VectorXd weights = belief.noise_variance.cwiseInverse();
+  VectorXd start = VectorXd::Zero(problem.carry_size());
+  const auto place = [&](const VectorXd& x) {
+    ScatterAdapted(problem, x, &all);
+    if (x.size() > problem.adapted_size()) start = x.tail(problem.carry_size());
+  };
+  const auto penalty = [&](const VectorXd& x) {
+    const VectorXd d = x - belief.mean;
+    return 0.5 * d.dot(belief.precision.selfadjointView<Eigen::Lower>() * d);
+  };
+  NormalEquations equations;
+  Objective objective;
+  objective.cost = [&](const VectorXd& x) {
+    place(x);
+    return problem.Cost(all.data(), start, weights, data, workspace) + penalty(x);
+  };
+  objective.linearise = [&](const VectorXd& x, QuadraticModel* model) {
+    place(x);
+    problem.Linearise(all.data(), start, weights, data, workspace, &equations);
+    model->cost = equations.cost + penalty(x);
+    model->gradient = equations.gradient + belief.precision.selfadjointView<Eigen::Lower>() * (x - belief.mean);
+    model->curvature = equations.curvature + belief.precision;
+  };
+  MapFit fit{.unknowns = from, .noise_variance = belief.noise_variance};
+  for (int round = 0; round < kNoiseRounds; ++round) {
+    const LevenbergMarquardtResult result =
+        MinimiseLevenbergMarquardt(objective, fit.unknowns, options.optimiser, on_iteration);
+    fit.unknowns = result.x;
+    fit.information = result.model.curvature.selfadjointView<Eigen::Lower>();
+    fit.channel_squares = equations.channel_squares;
+    fit.cost = result.model.cost;
+    fit.iterations += result.iterations;
+    fit.converged = result.converged;
+    fit.stopped = result.stopped;
+    if (std::isinf(options.noise_samples) || result.stopped) break;
+    const VectorXd before = fit.noise_variance;
+    const int64_t samples = int64_t{data.shape.rollouts} * data.shape.horizon;
+    fit.noise_variance = EstimateNoise(belief, fit, samples, options.noise_samples);
+    weights = fit.noise_variance.cwiseInverse();
+    double change = 0;
+    for (Index c = 0; c < before.size(); ++c) {
+      if (std::isfinite(before[c])) change = std::max(change, std::fabs(fit.noise_variance[c] / before[c] - 1));
+    }
+    if (change < kNoiseConverged) break;
+  }
+  return fit;
+}
+
+}  // namespace metaekf::meta

@@ -1,0 +1,52 @@
+#pragma once
+
+#include <Eigen/Core>
+#include <functional>
+#include <vector>
+
+#include "core/meta/levenberg_marquardt.h"
+#include "core/nssm/least_squares.h"
+
+namespace metaekf::meta {
+
+/// What is believed of the unknowns of a fit before its data are seen: N(mean, precision⁻¹), and the noise of every
+/// channel. In normalised units; unknowns as RolloutLeastSquares orders them.
+struct Belief {
+  Eigen::VectorXd mean;
+  Eigen::MatrixXd precision;       ///< Λ, symmetric
+  Eigen::VectorXd noise_variance;  ///< σ², one per channel; infinite: the channel is not used
+};
+
+/// The most probable unknowns of one system, and how sure they are.
+struct MapFit {
+  Eigen::VectorXd unknowns;
+  Eigen::MatrixXd information;     ///< Λ + Jᵀ W J at the optimum: the inverse of the posterior covariance (Laplace)
+  Eigen::VectorXd noise_variance;  ///< as estimated from the residuals, with the belief's worth `noise_samples` samples
+  Eigen::VectorXd channel_squares; ///< Σ r² of every channel
+  double cost = 0;                 ///< ½ Σ w r² + ½ (θ − m)ᵀ Λ (θ − m)
+  int iterations = 0;
+  bool converged = false;
+  bool stopped = false;
+};
+
+struct MapFitOptions {
+  LevenbergMarquardtOptions optimiser;
+  /// How many samples' worth of evidence the belief's noise variance counts for; infinite: it is not estimated.
+  double noise_samples = std::numeric_limits<double>::infinity();
+};
+
+/// Minimises ½ Σ_c Σ r_c²/σ_c² + ½ (θ − m)ᵀ Λ (θ − m) over the unknowns θ.
+///
+/// @param parameters  ω, of which the adapted part is not read.
+/// @param from        where to start.
+MapFit FitMap(const nssm::RolloutLeastSquares& problem, const nssm::LossData<double>& data,
+              const std::vector<double>& parameters, const Belief& belief, const Eigen::VectorXd& from,
+              const MapFitOptions& options, nssm::RolloutLeastSquares::Workspace* workspace,
+              const std::function<bool(int, double)>& on_iteration = nullptr);
+
+/// Puts the adapted part of `unknowns` into ω, and the other way round.
+void ScatterAdapted(const nssm::RolloutLeastSquares& problem, const Eigen::VectorXd& unknowns,
+                    std::vector<double>* parameters);
+Eigen::VectorXd GatherAdapted(const nssm::RolloutLeastSquares& problem, const std::vector<double>& parameters);
+
+}  // namespace metaekf::meta
