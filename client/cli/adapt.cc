@@ -45,6 +45,7 @@ absl::Status Adapt(const Flags& flags, Console& console) {
   if (flags.method == "gradient") request.method = client::AdaptationMethod::kGradientDescent;
   if (flags.method == "adam") request.method = client::AdaptationMethod::kAdam;
   if (flags.method == "from-scratch") request.method = client::AdaptationMethod::kFromScratch;
+  if (flags.method == "map") request.method = client::AdaptationMethod::kLevenbergMarquardt;
   if (flags.steps > 0) request.inner_loop.steps = flags.steps;
   if (flags.learning_rate > 0) request.inner_loop.learning_rate = flags.learning_rate;
 
@@ -77,9 +78,10 @@ void AddAdapt(CLI::App& app, Console& console, Command& chosen) {
                       "Id of the adaptation (default: chosen by the server)");
   command
       ->add_option("--method", flags->method,
-                   "gradient (the inner loop), adam, or from-scratch (the baseline without "
-                   "meta-learning); default: what the model was trained for")
-      ->check(CLI::IsMember({"gradient", "adam", "from-scratch"}));
+                   "gradient (the inner loop), adam, map (the most probable parameters, by "
+                   "Levenberg–Marquardt), or from-scratch (the baseline without meta-learning); "
+                   "default: what the model was trained for")
+      ->check(CLI::IsMember({"gradient", "adam", "map", "from-scratch"}));
   command->add_option("--inner-steps", flags->steps, "Steps (default: the model's)")
       ->check(CLI::PositiveNumber);
   command->add_option("--inner-lr", flags->learning_rate, "Learning rate (default: the model's)")
@@ -87,6 +89,8 @@ void AddAdapt(CLI::App& app, Console& console, Command& chosen) {
   command->add_option("--adapt", flags->request.inner_loop.adapted_mask,
                       "Which parameters adapt, e.g. encoder.4-5,transition (default: the model's)");
   command->add_option("--seed", flags->request.seed, "Seed of from-scratch (default 0)");
+  command->add_flag("--require-better-than-arx", flags->request.require_better_than_arx,
+                    "Refuse the adaptation unless it beats linear ARX in free run");
   flags->data.AddTo(command);
   OnChosen(command, chosen, [flags, &console] { return Adapt(*flags, console); });
 }

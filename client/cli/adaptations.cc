@@ -1,4 +1,3 @@
-#include <cmath>
 #include <string_view>
 
 #include "absl/strings/str_cat.h"
@@ -15,19 +14,12 @@ const char* Word(client::AdaptationMethod method) {
       return "adam";
     case client::AdaptationMethod::kFromScratch:
       return "from-scratch";
+    case client::AdaptationMethod::kLevenbergMarquardt:
+      return "map";
     case client::AdaptationMethod::kGradientDescent:
       break;
   }
   return "gradient";
-}
-
-/// Errors of all outputs in one unit-free number, the geometric mean of their ratios to `other`;
-/// NaN if there are none.
-double Ratio(const std::vector<double>& errors, const std::vector<double>& other) {
-  if (errors.empty() || errors.size() != other.size()) return std::nan("");
-  double log_ratio = 0;
-  for (size_t i = 0; i < errors.size(); ++i) log_ratio += std::log(errors[i] / other[i]);
-  return std::exp(log_ratio / static_cast<double>(errors.size()));
 }
 
 Record At(const std::vector<double>& values, size_t i) {
@@ -123,13 +115,8 @@ std::string Verdict(const client::Adaptation& adaptation) {
     return "The context is too short to hold a tail out: nothing says how good the adapted model "
            "is.";
   }
-  const auto& held_out = *adaptation.held_out;
-  const double to_before = Ratio(held_out.after.simulate, held_out.before.simulate);
-  const double to_arx = Ratio(held_out.after.simulate, held_out.arx.simulate);
-  // A baseline that diverged, or is not there, gives no number; what did not diverge beats it.
-  const bool finite = std::isfinite(Ratio(held_out.after.simulate, held_out.after.simulate));
-  const bool beats_before = to_before < 1 || (finite && std::isnan(to_before));
-  const bool beats_arx = to_arx < 1 || (finite && std::isnan(to_arx));
+  const bool beats_before = adaptation.held_out->better_than_unadapted;
+  const bool beats_arx = adaptation.held_out->better_than_arx;
   if (beats_before && beats_arx) {
     return "In free run the adapted model beats both the unadapted one and linear ARX.";
   }

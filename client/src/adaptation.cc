@@ -14,6 +14,7 @@ Result<Adaptation> Client::Adapt(const AdaptationRequest& request,
   options->set_method(ToProto(request.method));
   ToProto(request.inner_loop, options->mutable_inner_loop());
   options->set_seed(request.seed);
+  options->set_require_better_than_arx(request.require_better_than_arx);
 
   using Stream = grpc::ClientReaderWriter<v1::AdaptRequest, v1::AdaptResponse>;
   grpc::ClientContext context;

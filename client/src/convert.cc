@@ -152,9 +152,18 @@ Adaptation FromProto(const v1::Adaptation& message) {
                         .context_loss_after = message.context_loss_after(),
                         .duration_s = message.duration_s(),
                         .create_time = ToTime(message.create_time())};
-  if (message.method() == v1::Adaptation::ADAM) adaptation.method = AdaptationMethod::kAdam;
-  if (message.method() == v1::Adaptation::FROM_SCRATCH) {
-    adaptation.method = AdaptationMethod::kFromScratch;
+  switch (message.method()) {
+    case v1::Adaptation::ADAM:
+      adaptation.method = AdaptationMethod::kAdam;
+      break;
+    case v1::Adaptation::FROM_SCRATCH:
+      adaptation.method = AdaptationMethod::kFromScratch;
+      break;
+    case v1::Adaptation::LEVENBERG_MARQUARDT:
+      adaptation.method = AdaptationMethod::kLevenbergMarquardt;
+      break;
+    default:
+      break;
   }
   const auto& loop = message.inner_loop();
   if (loop.has_steps()) adaptation.inner_loop.steps = loop.steps();
@@ -162,7 +171,8 @@ Adaptation FromProto(const v1::Adaptation& message) {
   if (message.has_held_out()) {
     const auto& held_out = message.held_out();
     adaptation.held_out = {held_out.samples(), ToErrors(held_out.before()),
-                           ToErrors(held_out.after()), ToErrors(held_out.arx())};
+                           ToErrors(held_out.after()), ToErrors(held_out.arx()),
+                           held_out.better_than_unadapted(), held_out.better_than_arx()};
   }
   return adaptation;
 }
@@ -243,6 +253,8 @@ v1::Adaptation::Method ToProto(std::optional<AdaptationMethod> method) {
       return v1::Adaptation::ADAM;
     case AdaptationMethod::kFromScratch:
       return v1::Adaptation::FROM_SCRATCH;
+    case AdaptationMethod::kLevenbergMarquardt:
+      return v1::Adaptation::LEVENBERG_MARQUARDT;
     default:
       return v1::Adaptation::GRADIENT_DESCENT;
   }

@@ -7,6 +7,7 @@
 #include "core/data/split.h"
 #include "core/meta/adam.h"
 #include "core/meta/arx.h"
+#include "core/meta/fit_plan.h"
 #include "core/nssm/loss.h"
 
 namespace metaekf::meta {
@@ -27,6 +28,8 @@ constexpr int64_t kMaxColumns = 1 << 17;
 constexpr int32_t kScratchSteps = 10;  // times those of an adaptation, as the paper allows its baseline
 constexpr double kScratchLearningRate = 3e-3;
 constexpr double kAdamLearningRate = 1e-3;
+constexpr int32_t kLevenbergMarquardtSteps = 60;
+constexpr double kUnknownNoiseVariance = 1e-2;  // normalised units
 
 absl::Status CheckFinite(const std::string& signal, const Eigen::MatrixXd& values) {
   for (Eigen::Index t = 0; t < values.cols(); ++t) {
@@ -42,6 +45,7 @@ absl::Status CheckFinite(const std::string& signal, const Eigen::MatrixXd& value
 struct FitResult {
   std::vector<double> parameters;
   double loss_before = 0, loss_after = 0;
+  Eigen::MatrixXd information;
 };
 
 absl::Status Diverged(int32_t step, double loss, double learning_rate) {
@@ -92,10 +96,55 @@ absl::StatusOr<FitResult> Fit(const Bundle& bundle, nssm::LossSpec loss, const T
   return result;
 }
 
+/// What stands in where no prior has been learned: N(ω₀, I/λ), and noise that the fit has yet to find out.
+nssm::GaussianPrior ProximalPrior(const FitPlan& plan, double proximal) {
+  const auto identity = [](Eigen::Index n) { return Eigen::MatrixXd(Eigen::MatrixXd::Identity(n, n)); };
+  nssm::GaussianPrior prior{.dynamics = proximal * identity(plan.dynamics.adapted_size()),
+                            .noise_variance = Eigen::VectorXd::Constant(plan.dynamics.channels(), kUnknownNoiseVariance)};
+  if (plan.encoder) prior.encoder = proximal * identity(plan.encoder->adapted_size());
+  if (plan.start) prior.start = identity(plan.start->carry_size());
+  return prior;
+}
+
+/// Levenberg–Marquardt, in double whatever the model's precision.
+absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const nssm::LossSpec& loss, const Trajectory& context,
+                                                  const nn::Mask& mask, const AdaptationOptions& options,
+                                                  const OnStep& on_step) {
+  const FitPlan plan(bundle.model, loss, mask);
+  const nssm::GaussianPrior prior = bundle.prior ? *bundle.prior : ProximalPrior(plan, options.inner_loop.proximal);
+  const int32_t steps = options.inner_loop.steps;
+  METAEKF_ASSIGN_OR_RETURN(const nssm::LossData<double> data, plan.dynamics.Cut(context));
+  const double values = static_cast<double>(data.outputs.size());
+  // Told: the mean square of the weighted residuals, in units of the noise.
+  const auto per_value = [&](double cost) { return 2 * cost / values; };
+  bool stopped = false;
+  int32_t step = 0;
+  METAEKF_ASSIGN_OR_RETURN(SystemFit fit, FitSystem(plan, prior, bundle.parameters, context, {.steps = steps}, [&](int, double cost) {
+    step = std::min(step + 1, steps);
+    stopped = on_step && !on_step({.step = step, .steps = steps, .loss = per_value(cost)});
+    return !stopped;
+  }));
+  if (stopped) return absl::CancelledError("the adaptation was cancelled");
+  FitResult result{.parameters = std::move(fit.parameters), .information = std::move(fit.dynamics.information)};
+  nssm::RoundToPrecision(bundle.model.spec().precision, &result.parameters);
+  nssm::RolloutLeastSquares::Workspace workspace(plan.dynamics, data.shape);
+  const Eigen::VectorXd weights = prior.noise_variance.cwiseInverse();
+  const auto loss_at = [&](const std::vector<double>& parameters, const Eigen::VectorXd& start) {
+    return per_value(plan.dynamics.Cost(parameters.data(), start, weights, data, &workspace));
+  };
+  const Eigen::VectorXd start = fit.dynamics.unknowns.tail(prior.start.rows());
+  result.loss_before = loss_at(bundle.parameters, Eigen::VectorXd::Zero(start.size()));
+  result.loss_after = loss_at(result.parameters, start);
+  return result;
+}
+
 absl::StatusOr<FitResult> FitAnyPrecision(const Bundle& bundle, const nssm::LossSpec& loss, const Trajectory& context,
                                           const nn::Mask& mask, const AdaptationOptions& options,
                                           const OnStep& on_step) {
   METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, context));
+  if (options.method == AdaptationMethod::kLevenbergMarquardt) {
+    return FitByLevenbergMarquardt(bundle, loss, normalised, mask, options, on_step);
+  }
   return bundle.model.spec().precision == nssm::Precision::kFloat32
              ? Fit<float>(bundle, loss, normalised, mask, options, on_step)
              : Fit<double>(bundle, loss, normalised, mask, options, on_step);
@@ -150,12 +199,32 @@ absl::StatusOr<Problem> Pose(const Bundle& bundle, const Trajectory& context, co
   return problem;
 }
 
+AdaptationMethod MethodOf(Optimiser optimiser) {
+  switch (optimiser) {
+    case Optimiser::kGradientDescent:
+      return AdaptationMethod::kGradientDescent;
+    case Optimiser::kAdam:
+      return AdaptationMethod::kAdam;
+    case Optimiser::kLevenbergMarquardt:
+      return AdaptationMethod::kLevenbergMarquardt;
+  }
+  return AdaptationMethod::kGradientDescent;
+}
+
 /// Samples of the context's end that are held out.
 int64_t TailSamples(const nssm::ModelSpec& model, int64_t samples) {
   return std::max<int64_t>(samples / 5, model.warmup() + 1);
 }
 
 }  // namespace
+
+bool BetterInFreeRun(const TailErrors& a, const TailErrors& b) {
+  double log_a = 0, log_b = 0;
+  for (const double error : a.simulate) log_a += std::log(error);
+  for (const double error : b.simulate) log_b += std::log(error);
+  if (a.simulate.empty() || !std::isfinite(log_a)) return false;
+  return b.simulate.empty() || !std::isfinite(log_b) || log_a < log_b;
+}
 
 absl::StatusOr<AdaptationOptions> DefaultAdaptation(const Bundle& bundle, std::optional<AdaptationMethod> method) {
   const absl::StatusOr<TrainingSpec> training = ReadTrainingSpec(bundle.training);
@@ -164,9 +233,7 @@ absl::StatusOr<AdaptationOptions> DefaultAdaptation(const Bundle& bundle, std::o
         absl::StrCat("the model does not say how it was trained: ", std::string(training.status().message())));
   }
   AdaptationOptions options{.inner_loop = training->adaptation};
-  const AdaptationMethod trained_for = options.inner_loop.optimiser == Optimiser::kAdam
-                                           ? AdaptationMethod::kAdam
-                                           : AdaptationMethod::kGradientDescent;
+  const AdaptationMethod trained_for = MethodOf(options.inner_loop.optimiser);
   options.method = method.value_or(trained_for);
   if (options.method == AdaptationMethod::kFromScratch) {
     options.inner_loop.steps *= kScratchSteps;
@@ -174,7 +241,9 @@ absl::StatusOr<AdaptationOptions> DefaultAdaptation(const Bundle& bundle, std::o
     options.inner_loop.adapted_mask = "*";
   } else if (options.method == AdaptationMethod::kAdam && trained_for != AdaptationMethod::kAdam) {
     options.inner_loop.learning_rate = kAdamLearningRate;
-  } else if (options.method == AdaptationMethod::kGradientDescent && trained_for == AdaptationMethod::kAdam) {
+  } else if (options.method == AdaptationMethod::kLevenbergMarquardt && trained_for != options.method) {
+    options.inner_loop.steps = kLevenbergMarquardtSteps;
+  } else if (options.method == AdaptationMethod::kGradientDescent && trained_for != options.method) {
     options.inner_loop.learning_rate = training->inner_loop.learning_rate;
   }
   return options;
@@ -219,6 +288,7 @@ absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& c
   METAEKF_ASSIGN_OR_RETURN(FitResult fit,
                            FitAnyPrecision(bundle, problem.loss, problem.context, problem.mask, options, on_step));
   result.parameters = std::move(fit.parameters);
+  result.information = std::move(fit.information);
   result.context_loss_before = fit.loss_before;
   result.context_loss_after = fit.loss_after;
   return result;

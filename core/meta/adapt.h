@@ -16,6 +16,7 @@ enum class AdaptationMethod {
   kGradientDescent,  ///< eq. maml_inner from the meta-learned parameters
   kAdam,             ///< the same loss and start, Adam steps
   kFromScratch,      ///< Adam from a random initialisation: the supervised baseline
+  kLevenbergMarquardt,  ///< the most probable parameters under the model's prior (FitSystem)
 };
 
 struct AdaptationOptions {
@@ -44,7 +45,13 @@ struct AdaptationResult {
   double context_loss_after = 0;
   int64_t tail_samples = 0;        ///< held out for the errors below
   TailErrors before, after, arx;
+  /// kLevenbergMarquardt: the inverse of the parameters' posterior covariance (Laplace), unknowns as FitPlan orders them.
+  Eigen::MatrixXd information;
 };
+
+/// Whether `a` is better than `b` in free run, all outputs together (geometric mean of the ratios, for outputs may have
+/// different units). What did not diverge is better than what did, or is not there.
+bool BetterInFreeRun(const TailErrors& a, const TailErrors& b);
 
 /// The adaptation alone: ω_M from the whole context, without errors on a tail. Arguments and errors as those of Adapt.
 absl::StatusOr<std::vector<double>> AdaptedParameters(const nssm::Bundle& bundle, const data::Trajectory& context,

@@ -9,10 +9,14 @@ using base::JsonFields;
 using nlohmann::json;
 
 const std::vector<std::pair<std::string, Algorithm>> kAlgorithms = {
-    {"MAML", Algorithm::kMaml}, {"FIRST_ORDER_MAML", Algorithm::kFirstOrderMaml}, {"SUPERVISED", Algorithm::kSupervised}};
+    {"MAML", Algorithm::kMaml}, {"FIRST_ORDER_MAML", Algorithm::kFirstOrderMaml}, {"SUPERVISED", Algorithm::kSupervised},
+    {"GAUSSIAN_PRIOR", Algorithm::kGaussianPrior}};
 
 const std::vector<std::pair<std::string, Optimiser>> kOptimisers = {{"GRADIENT_DESCENT", Optimiser::kGradientDescent},
-                                                                    {"ADAM", Optimiser::kAdam}};
+                                                                    {"ADAM", Optimiser::kAdam},
+                                                                    {"LEVENBERG_MARQUARDT", Optimiser::kLevenbergMarquardt}};
+
+constexpr int32_t kGaussianPriorSteps = 60;  // of Levenberg–Marquardt at adaptation
 
 constexpr int32_t kMany = 100'000'000;
 
@@ -30,6 +34,7 @@ InnerLoopSpec ReadInnerLoop(JsonFields* parent, const std::string& name, InnerLo
   spec.learning_rate = fields.Number("learning_rate", spec.learning_rate, 0, 1e6);
   spec.adapted_mask = fields.String("adapted_mask", spec.adapted_mask);
   spec.optimiser = fields.Choice("optimiser", spec.optimiser, kOptimisers);
+  spec.proximal = fields.Number("proximal", spec.proximal, 0, 1e12);
   parent->Include(fields.Finish());
   return spec;
 }
@@ -38,7 +43,24 @@ json InnerLoopJson(const InnerLoopSpec& spec) {
   return {{"steps", spec.steps},
           {"learning_rate", spec.learning_rate},
           {"adapted_mask", spec.adapted_mask},
-          {"optimiser", NameOf(kOptimisers, spec.optimiser)}};
+          {"optimiser", NameOf(kOptimisers, spec.optimiser)},
+          {"proximal", spec.proximal}};
+}
+
+GaussianPriorSpec ReadGaussianPrior(JsonFields* parent) {
+  GaussianPriorSpec spec;
+  JsonFields fields = parent->Object("gaussian_prior");
+  const auto positive = [&fields](const std::string& name, int32_t default_value) {
+    const int32_t value = static_cast<int32_t>(fields.Integer(name, default_value, 0, kMany));
+    return value == 0 ? default_value : value;
+  };
+  spec.initial_std = fields.Number("initial_std", spec.initial_std, 1e-9, 1e9);
+  spec.rounds = positive("rounds", spec.rounds);
+  spec.restarts = positive("restarts", spec.restarts);
+  spec.first_steps = positive("first_steps", spec.first_steps);
+  spec.round_steps = positive("round_steps", spec.round_steps);
+  parent->Include(fields.Finish());
+  return spec;
 }
 
 }  // namespace
@@ -50,10 +72,16 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
   METAEKF_ASSIGN_OR_RETURN(spec.loss, nssm::ReadLossSpec(fields.Object("loss"), spec.model));
   spec.algorithm = fields.Choice("algorithm", Algorithm::kMaml, kAlgorithms);
   spec.inner_loop = ReadInnerLoop(&fields, "inner_loop", InnerLoopSpec());
-  if (spec.inner_loop.optimiser == Optimiser::kAdam) {
-    fields.Fail("inner_loop.optimiser", "the inner loop of training is gradient descent; ADAM is for adaptation");
+  if (spec.inner_loop.optimiser != Optimiser::kGradientDescent) {
+    fields.Fail("inner_loop.optimiser", "the inner loop of training is GRADIENT_DESCENT; the others are for adaptation");
   }
-  spec.adaptation = ReadInnerLoop(&fields, "adaptation", spec.inner_loop);
+  spec.gaussian_prior = ReadGaussianPrior(&fields);
+  InnerLoopSpec adaptation = spec.inner_loop;
+  if (spec.algorithm == Algorithm::kGaussianPrior) {
+    adaptation.optimiser = Optimiser::kLevenbergMarquardt;
+    adaptation.steps = kGaussianPriorSteps;
+  }
+  spec.adaptation = ReadInnerLoop(&fields, "adaptation", adaptation);
   const auto positive = [&fields](const std::string& name, int32_t default_value) {
     const int32_t value = static_cast<int32_t>(fields.Integer(name, default_value, 0, kMany));
     return value == 0 ? default_value : value;
@@ -82,6 +110,12 @@ json ToJson(const TrainingSpec& spec) {
           {"algorithm", NameOf(kAlgorithms, spec.algorithm)},
           {"inner_loop", InnerLoopJson(spec.inner_loop)},
           {"adaptation", InnerLoopJson(spec.adaptation)},
+          {"gaussian_prior",
+           {{"initial_std", spec.gaussian_prior.initial_std},
+            {"rounds", spec.gaussian_prior.rounds},
+            {"restarts", spec.gaussian_prior.restarts},
+            {"first_steps", spec.gaussian_prior.first_steps},
+            {"round_steps", spec.gaussian_prior.round_steps}}},
           {"context_samples", spec.context_samples},
           {"target_samples", spec.target_samples},
           {"task_batch", spec.task_batch},

@@ -8,16 +8,26 @@
 
 namespace metaekf::meta {
 
-enum class Algorithm { kMaml, kFirstOrderMaml, kSupervised };
+enum class Algorithm { kMaml, kFirstOrderMaml, kSupervised, kGaussianPrior };
 
-enum class Optimiser { kGradientDescent, kAdam };
+enum class Optimiser { kGradientDescent, kAdam, kLevenbergMarquardt };
 
 /// The inner loop, in training or at adaptation: the message InnerLoopSpec of spec.proto.
 struct InnerLoopSpec {
   int32_t steps = 10;
   double learning_rate = 0.01;
   std::string adapted_mask = "*";
-  Optimiser optimiser = Optimiser::kGradientDescent;  ///< kAdam at adaptation only
+  Optimiser optimiser = Optimiser::kGradientDescent;  ///< the others at adaptation only
+  double proximal = 1;  ///< λ of kLevenbergMarquardt where no prior has been learned
+};
+
+/// Empirical Bayes: the message GaussianPriorSpec of spec.proto.
+struct GaussianPriorSpec {
+  double initial_std = 0.1;
+  int32_t rounds = 6;
+  int32_t restarts = 6;
+  int32_t first_steps = 60;
+  int32_t round_steps = 10;
 };
 
 /// How a model is meta-trained: the message TrainingSpec of spec.proto, where each field is described.
@@ -27,6 +37,7 @@ struct TrainingSpec {
   Algorithm algorithm = Algorithm::kMaml;
   InnerLoopSpec inner_loop;
   InnerLoopSpec adaptation;
+  GaussianPriorSpec gaussian_prior;
   int32_t context_samples = 100;
   int32_t target_samples = 100;
   int32_t task_batch = 8;

@@ -1,12 +1,14 @@
 #pragma once
 
 #include <nlohmann/json.hpp>
+#include <optional>
 #include <string>
 #include <vector>
 
 #include "absl/status/statusor.h"
 #include "core/data/normaliser.h"
 #include "core/nssm/model.h"
+#include "core/nssm/prior.h"
 
 namespace metaekf::nssm {
 
@@ -30,6 +32,7 @@ struct Bundle {
   double sample_period_s = 0;
   ChannelNames names;
   FilterNoise noise;
+  std::optional<GaussianPrior> prior;
   /// Specification of the training, as JSON: `adapt` takes its defaults from it.
   nlohmann::json training;
   /// Where the model comes from: seed, data digest, losses.

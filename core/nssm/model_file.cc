@@ -12,6 +12,7 @@ using base::JsonFields;
 using nlohmann::json;
 
 constexpr char kMetadataKey[] = "metaekf";
+constexpr char kPriorPrefix[] = "prior.";
 
 json ListOf(const Eigen::VectorXd& vector) { return std::vector<double>(vector.begin(), vector.end()); }
 
@@ -95,11 +96,60 @@ absl::Status StoreTensor(const Safetensors::Tensor& tensor, Bundle* bundle, nn::
   return absl::InvalidArgumentError(absl::StrCat("tensor \"", tensor.name, "\" is not part of the model"));
 }
 
+/// The matrices of a prior by the names of their tensors.
+template <typename Prior, typename Visit>
+void ForEachPriorMatrix(Prior& prior, const Visit& visit) {
+  visit("dynamics", prior.dynamics);
+  visit("encoder", prior.encoder);
+  visit("start", prior.start);
+  visit("examples", prior.examples);
+}
+
+void AppendPrior(const GaussianPrior& prior, Safetensors* file) {
+  const auto append = [file](const std::string& name, std::vector<int64_t> shape, std::vector<double> values) {
+    file->tensors.push_back({.name = kPriorPrefix + name, .shape = std::move(shape), .values = std::move(values)});
+  };
+  ForEachPriorMatrix(prior, [&](const std::string& name, const Eigen::MatrixXd& matrix) {
+    if (matrix.size() == 0) return;
+    const Eigen::MatrixXd transposed = matrix.transpose();  // row-major
+    append(name, {matrix.rows(), matrix.cols()},
+           std::vector<double>(transposed.data(), transposed.data() + transposed.size()));
+  });
+  append("noise_variance", {prior.noise_variance.size()},
+         std::vector<double>(prior.noise_variance.begin(), prior.noise_variance.end()));
+}
+
+absl::Status StorePriorTensor(const Safetensors::Tensor& tensor, GaussianPrior* prior) {
+  const auto invalid = [&](const std::string& reason) {
+    return absl::InvalidArgumentError(absl::StrCat("tensor \"", tensor.name, "\" ", reason));
+  };
+  const std::string name = tensor.name.substr(sizeof(kPriorPrefix) - 1);
+  if (name == "noise_variance") {
+    prior->noise_variance = Eigen::Map<const Eigen::VectorXd>(tensor.values.data(), static_cast<Eigen::Index>(tensor.values.size()));
+    if ((prior->noise_variance.array() <= 0).any()) return invalid("must be positive");
+    return absl::OkStatus();
+  }
+  bool known = false;
+  absl::Status status = absl::OkStatus();
+  ForEachPriorMatrix(*prior, [&](const std::string& candidate, Eigen::MatrixXd& matrix) {
+    if (candidate != name) return;
+    known = true;
+    if (tensor.shape.size() != 2) {
+      status = invalid("is not a matrix");
+      return;
+    }
+    matrix = Eigen::Map<const Eigen::MatrixXd>(tensor.values.data(), tensor.shape[1], tensor.shape[0]).transpose();
+    if (name != "examples" && !matrix.isApprox(matrix.transpose(), 1e-9)) status = invalid("is not symmetric");
+  });
+  return known ? status : invalid("is not part of a prior");
+}
+
 }  // namespace
 
 std::string WriteModelFile(const Bundle& bundle) {
   Safetensors file;
   for (const nn::Tensor& tensor : bundle.model.layout().tensors()) file.tensors.push_back(TensorOf(tensor, bundle));
+  if (bundle.prior) AppendPrior(*bundle.prior, &file);
   const json description = {
       {"format_version", kModelFormatVersion},
       {"model", ToJson(bundle.model.spec())},
@@ -163,7 +213,14 @@ absl::StatusOr<Bundle> ReadModelFile(const std::string& bytes) {
   bundle.provenance = object.value("provenance", json::object());
   bundle.parameters.assign(static_cast<size_t>(bundle.model.layout().size()), 0.0);
   nn::Mask seen(bundle.model.layout().tensors().size(), false);
-  for (const Safetensors::Tensor& tensor : file.tensors) METAEKF_RETURN_IF_ERROR(StoreTensor(tensor, &bundle, &seen));
+  for (const Safetensors::Tensor& tensor : file.tensors) {
+    if (tensor.name.rfind(kPriorPrefix, 0) != 0) {
+      METAEKF_RETURN_IF_ERROR(StoreTensor(tensor, &bundle, &seen));
+      continue;
+    }
+    if (!bundle.prior) bundle.prior.emplace();
+    METAEKF_RETURN_IF_ERROR(StorePriorTensor(tensor, &*bundle.prior));
+  }
   for (size_t i = 0; i < seen.size(); ++i) {
     if (!seen[i]) {
       return absl::InvalidArgumentError(absl::StrCat("tensor \"", bundle.model.layout().tensors()[i].name, "\" is missing"));

@@ -154,6 +154,8 @@ absl::StatusOr<LossSpec> ReadLossSpec(JsonFields fields, const ModelSpec& model)
   spec.output_weight = fields.Number("output_weight", 1, 0, kLargeNumber);
   spec.state_weight = fields.Number("state_weight", model.is_case_one() ? 0 : 1, 0, kLargeNumber);
   spec.reconstruction_weight = fields.Number("reconstruction_weight", model.is_case_one() ? 0 : 1, 0, kLargeNumber);
+  spec.free_start = fields.Bool("free_start", false);
+  if (spec.free_start && !model.is_case_one()) fields.Fail("free_start", "is for Case I; in Case II the start is measured");
   if (model.is_case_one() && spec.rollout == RolloutMode::kState) {
     fields.Fail("rollout", "STATE needs Case II: Case I has no state to encode again");
   }
@@ -198,7 +200,8 @@ json ToJson(const LossSpec& spec) {
                  {"stride", spec.stride},
                  {"output_weight", spec.output_weight},
                  {"state_weight", spec.state_weight},
-                 {"reconstruction_weight", spec.reconstruction_weight}};
+                 {"reconstruction_weight", spec.reconstruction_weight},
+                 {"free_start", spec.free_start}};
   if (spec.horizon == LossSpec::kWholeSet) {
     result["whole_set_horizon"] = true;
   } else {

@@ -60,6 +60,7 @@ struct LossSpec {
   double output_weight = 1;
   double state_weight = 1;
   double reconstruction_weight = 1;
+  bool free_start = false;  ///< Levenberg–Marquardt in Case I: c₀ is an unknown, the encoder fitted afterwards
 };
 
 /// Read the JSON forms of the messages. Errors: InvalidArgument naming the field and what is wrong with it.

@@ -30,6 +30,8 @@ absl::StatusOr<std::optional<AdaptationMethod>> ToCore(v1::Adaptation::Method me
       return AdaptationMethod::kAdam;
     case v1::Adaptation::FROM_SCRATCH:
       return AdaptationMethod::kFromScratch;
+    case v1::Adaptation::LEVENBERG_MARQUARDT:
+      return AdaptationMethod::kLevenbergMarquardt;
     default:
       return FieldViolation("options.method",
                             absl::StrCat(static_cast<int>(method), " is no method known here"));
@@ -44,6 +46,8 @@ v1::Adaptation::Method ToMessage(AdaptationMethod method) {
       return v1::Adaptation::ADAM;
     case AdaptationMethod::kFromScratch:
       return v1::Adaptation::FROM_SCRATCH;
+    case AdaptationMethod::kLevenbergMarquardt:
+      return v1::Adaptation::LEVENBERG_MARQUARDT;
   }
   return v1::Adaptation::METHOD_UNSPECIFIED;
 }
@@ -109,6 +113,8 @@ std::string AdaptationReceipt(const meta::AdaptationOptions& options,
     *held_out.mutable_before() = ToMessage(result.before);
     *held_out.mutable_after() = ToMessage(result.after);
     *held_out.mutable_arx() = ToMessage(result.arx);
+    held_out.set_better_than_unadapted(meta::BetterInFreeRun(result.after, result.before));
+    held_out.set_better_than_arx(meta::BetterInFreeRun(result.after, result.arx));
   }
   message.set_duration_s(duration_s);
   return MessageToJson(message);

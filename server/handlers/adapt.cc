@@ -90,6 +90,11 @@ class AdaptCall final : public StreamHandler<Request, Response> {
 
   absl::Status Store(meta::AdaptationResult result, const store::RequestId& id, double duration_s,
                      Sink& sink) {
+    if (request_.require_better_than_arx() && !meta::BetterInFreeRun(result.after, result.arx)) {
+      return absl::FailedPreconditionError(
+          "the adapted model is not better than linear ARX in free run on the context's tail, as was required; a longer "
+          "context may help");
+    }
     nssm::Bundle adapted = model_->bundle;
     adapted.parameters = std::move(result.parameters);
     METAEKF_ASSIGN_OR_RETURN(

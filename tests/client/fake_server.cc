@@ -381,6 +381,8 @@ FakeAdaptations::FakeAdaptations() {
   SetErrors(0.5, 0.75, held_out->mutable_before());
   SetErrors(0.125, 0.25, held_out->mutable_after());
   SetErrors(0.0625, 0.5, held_out->mutable_arx());
+  held_out->set_better_than_unadapted(true);
+  held_out->set_better_than_arx(true);
 }
 
 void FakeAdaptations::SetErrors(double one_step, double simulate, v1::HeldOutErrors::Rmse* errors) {

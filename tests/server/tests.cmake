@@ -18,7 +18,7 @@ foreach(test adaptation_service model_service prediction_service training_servic
 endforeach()
 metaekf_test(server/server_test.cc DEPS metaekf::server_test_support)
 metaekf_test(server/training/resume_test.cc DEPS metaekf::server_test_support)
-metaekf_test(server/fault/kill_test.cc DEPS metaekf::server_test_support metaekf::server_training)
+metaekf_test(server/fault/kill_test.cc TIMEOUT 600 DEPS metaekf::server_test_support metaekf::server_training)
 metaekf_test(server/main_test.cc DEPS metaekf::server_test_support metaekf::server_training)
 metaekf_test(server/names/resource_names_test.cc DEPS metaekf::server_names)
 foreach(test samples spec)

@@ -168,7 +168,7 @@ struct Job {
   }
 };
 
-enum class AdaptationMethod { kGradientDescent, kAdam, kFromScratch };
+enum class AdaptationMethod { kGradientDescent, kAdam, kFromScratch, kLevenbergMarquardt };
 
 /// m steps of learning rate β_in on the parameters that the mask names.
 struct InnerLoop {
@@ -183,6 +183,7 @@ struct AdaptationRequest {
   std::optional<AdaptationMethod> method;  ///< none: what the model was trained for
   InnerLoop inner_loop;                    ///< what is left out is the model's
   uint64_t seed = 0;
+  bool require_better_than_arx = false;  ///< refuse what is not, in free run on the context's tail
   Trajectory context;
   std::string request_id;
 };
@@ -201,6 +202,7 @@ struct OutputErrors {
 struct HeldOutErrors {
   uint32_t samples = 0;
   OutputErrors before, after, arx;
+  bool better_than_unadapted = false, better_than_arx = false;  ///< adapted, in free run, all outputs together
 };
 
 struct Adaptation {

@@ -1,7 +1,6 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
-#include <cmath>
 #include <nlohmann/json.hpp>
 
 #include "tests/client/fake_server.h"
@@ -69,23 +68,22 @@ TEST_F(AdaptTest, TheReceiptComparesWithTheUnadaptedModelAndArx) {
 
 TEST_F(AdaptTest, AModelThatBeatsNothingIsCalledSo) {
   auto* held_out = server_.adaptations.adaptation.mutable_held_out();
-  FakeAdaptations::SetErrors(0.5, 1.0, held_out->mutable_after());  // 0.75 before, ARX 0.5
+  held_out->set_better_than_unadapted(false);
+  held_out->set_better_than_arx(false);
   EXPECT_THAT(Adapt({}).out, HasSubstr("beats neither the unadapted one nor linear ARX"));
-  FakeAdaptations::SetErrors(0.5, 0.6, held_out->mutable_after());
+  held_out->set_better_than_unadapted(true);
   EXPECT_THAT(Adapt({}).out, HasSubstr("but not linear ARX"));
-  FakeAdaptations::SetErrors(0.5, 2.0, held_out->mutable_arx());
-  FakeAdaptations::SetErrors(0.5, 1.0, held_out->mutable_after());
+  held_out->set_better_than_unadapted(false);
+  held_out->set_better_than_arx(true);
   EXPECT_THAT(Adapt({}).out, HasSubstr("but not the unadapted one"));
   server_.adaptations.adaptation.clear_held_out();
   EXPECT_THAT(Adapt({}).out, HasSubstr("too short to hold a tail out"));
 }
 
-TEST_F(AdaptTest, ABaselineThatDivergedIsBeaten) {
-  auto* held_out = server_.adaptations.adaptation.mutable_held_out();
-  FakeAdaptations::SetErrors(0.5, std::nan(""), held_out->mutable_arx());
-  EXPECT_THAT(Adapt({}).out, HasSubstr("beats both"));
-  FakeAdaptations::SetErrors(0.5, std::nan(""), held_out->mutable_after());
-  EXPECT_THAT(Adapt({}).out, HasSubstr("beats neither"));
+TEST_F(AdaptTest, MethodAndRequirementAreSent) {
+  EXPECT_EQ(Adapt({"--method", "map", "--require-better-than-arx"}).status, 0);
+  EXPECT_EQ(server_.adaptations.options.method(), v1::Adaptation::LEVENBERG_MARQUARDT);
+  EXPECT_TRUE(server_.adaptations.options.require_better_than_arx());
 }
 
 TEST_F(AdaptTest, AShortContextIsAnsweredWithTheSamplesNeeded) {

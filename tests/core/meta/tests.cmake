@@ -1,4 +1,5 @@
 metaekf_test(core/meta/arx_test.cc DEPS metaekf::core_meta)
+metaekf_test(core/meta/empirical_bayes_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/levenberg_marquardt_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/map_fit_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/meta_gradient_test.cc DEPS metaekf::core_meta)

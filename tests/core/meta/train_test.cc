@@ -87,8 +87,8 @@ TEST(TrainTest, AResumedTrainingEqualsAnUninterruptedOne) {
 }
 
 TEST(TrainTest, ACheckpointOfAnotherTrainingIsRefused) {
-  const std::string checkpoint = WriteCheckpoint({.parameters = {1}, .first_moment = {0}, .second_moment = {0}, .best_parameters = {1}}, "a");
-  EXPECT_TRUE(ReadCheckpoint(checkpoint, "a").ok());
+  const std::string checkpoint = WriteCheckpoint({.iteration = 3, .values = {{"parameters", {1, 2}}}}, "a");
+  EXPECT_EQ(ReadCheckpoint(checkpoint, "a")->values.at("parameters"), (std::vector<double>{1, 2}));
   EXPECT_EQ(ReadCheckpoint(checkpoint, "b").status().code(), absl::StatusCode::kInvalidArgument);
   EXPECT_FALSE(ReadCheckpoint(checkpoint.substr(0, checkpoint.size() - 3), "a").ok());
 }
@@ -165,6 +165,18 @@ TEST(AdaptTest, ZeroStepsLeaveTheModelAndFullyFrozenTensorsStay) {
                                   result.parameters.begin() + tensor.offset);
     EXPECT_EQ(equal, !adapts) << tensor.name;
   }
+}
+
+TEST(TrainTest, BetterInFreeRunComparesAllOutputsTogether) {
+  const double nan = std::numeric_limits<double>::quiet_NaN();
+  const auto errors = [](std::vector<double> simulate) { return TailErrors{.simulate = std::move(simulate)}; };
+  EXPECT_TRUE(BetterInFreeRun(errors({1, 1}), errors({1, 1.1})));
+  EXPECT_TRUE(BetterInFreeRun(errors({2, 1}), errors({1, 3})));  // twice as bad in one, three times as good in the other
+  EXPECT_FALSE(BetterInFreeRun(errors({2, 1}), errors({1, 2})));
+  EXPECT_TRUE(BetterInFreeRun(errors({9}), errors({nan})));  // what diverged is beaten
+  EXPECT_TRUE(BetterInFreeRun(errors({9}), errors({})));
+  EXPECT_FALSE(BetterInFreeRun(errors({nan}), errors({9})));
+  EXPECT_FALSE(BetterInFreeRun(errors({}), errors({9})));
 }
 
 }  // namespace

@@ -66,10 +66,11 @@ v1::TrainingSpec FullSpec() {
   model.mutable_output_constraint()->mutable_curl_free()->set_position_states(0, 0);
   model.mutable_output_constraint()->mutable_curl_free()->set_position_states(1, 1);
   model.set_output_size(2);  // as many as positions
-  // ADAM is for adaptation.
+  // The others are for adaptation.
   spec.mutable_inner_loop()->set_optimiser(v1::InnerLoopSpec::GRADIENT_DESCENT);
   // Read as the whole set, which has no number.
   spec.mutable_loss()->clear_horizon();
+  spec.mutable_loss()->set_free_start(false);  // of Case I
   return spec;
 }
 

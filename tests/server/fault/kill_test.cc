@@ -17,7 +17,7 @@ using ::testing::IsEmpty;
 using ::testing::SizeIs;
 
 constexpr int kRounds = 20;
-constexpr int kPieces = 8;  // what may get done before the kill, on whatever machine
+constexpr int kPieces = 3;  // what may get done before the kill, on whatever machine
 
 class KillTest : public testing::Test {
  protected:

@@ -1,0 +1,30 @@
+#pragma once
+
+#include <vector>
+
+#include "absl/status/statusor.h"
+#include "core/meta/outer_loop.h"
+
+namespace metaekf::meta {
+
+struct LearnedPrior {
+  std::vector<double> parameters;  ///< ω₀
+  nssm::GaussianPrior prior;
+};
+
+/// Learns ω ~ N(ω₀, Λ⁻¹) over a fleet by expectation–maximisation with Laplace's approximation.
+///
+///   E: ω_s = argmin ½ Σ r²/σ² + ½ (ω − ω₀)ᵀ Λ (ω − ω₀),   P_s = (Λ + JᵀJ/σ²)⁻¹       for every system s
+///   M: ω₀ = mean of ω_s,   Λ⁻¹ = mean of (ω_s − ω₀)(ω_s − ω₀)ᵀ + P_s,   σ² = median of the residuals' variance
+///
+/// The first ω₀ is the best of several fits of one system, each from a start of its own. Systems whose fit has stalled,
+/// recognised by residuals far above the others', do not count in the M-step and begin the next round from the fits of
+/// others. With a free start the encoder follows in rounds of its own. Held-out systems judge every round: the best prior
+/// is returned.
+///
+/// Errors: Cancelled if on_step said so; OutOfRange if no start of the first fit simulates its system.
+absl::StatusOr<LearnedPrior> LearnGaussianPrior(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
+                                                const Systems& systems, base::Executor* executor, TrainingState* state,
+                                                const OnTrainingStep& on_step);
+
+}  // namespace metaekf::meta

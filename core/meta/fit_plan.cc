@@ -1,0 +1,176 @@
+#include "core/meta/fit_plan.h"
+
+#include <algorithm>
+#include <cmath>
+
+#include "core/base/status.h"
+#include "core/data/split.h"
+
+namespace metaekf::meta {
+
+using data::Trajectory;
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using nssm::GaussianPrior;
+using nssm::LossData;
+using nssm::RolloutLeastSquares;
+
+namespace {
+
+constexpr Index kScreeningSamples = 1000;  // of the context, to choose among starts
+constexpr int kScreeningSteps = 4;         // for c₀ of each
+constexpr size_t kContenders = 3;          // starts that go on
+constexpr int kContenderSteps = 10;
+constexpr double kContenderTolerance = 1e-3;
+constexpr double kNoiseSamples = 200;      // that the fleet's noise variance counts for beside the system's own
+
+bool IsEncoder(const nn::Tensor& tensor) { return tensor.name.rfind("encoder.", 0) == 0; }
+
+nn::Mask Restrict(const nssm::Model& model, const nn::Mask& mask, bool encoder) {
+  nn::Mask restricted = mask;
+  for (size_t i = 0; i < mask.size(); ++i) {
+    if (IsEncoder(model.layout().tensors()[i]) != encoder) restricted[i] = false;
+  }
+  return restricted;
+}
+
+VectorXd MeanOf(const RolloutLeastSquares& problem, const std::vector<double>& mean) {
+  VectorXd unknowns = VectorXd::Zero(problem.unknowns());
+  unknowns.head(problem.adapted_size()) = GatherAdapted(problem, mean);
+  return unknowns;
+}
+
+/// ½ (x − m)ᵀ Λ (x − m) of the adapted part.
+double Penalty(const Belief& belief, const VectorXd& x, Index adapted) {
+  const VectorXd d = x.head(adapted) - belief.mean.head(adapted);
+  return 0.5 * d.dot(belief.precision.topLeftCorner(adapted, adapted).selfadjointView<Eigen::Lower>() * d);
+}
+
+/// A point to fit from, and Φ there.
+struct Candidate {
+  double cost = 0;
+  VectorXd unknowns;
+};
+
+void SortByCost(std::vector<Candidate>* candidates) {
+  std::stable_sort(candidates->begin(), candidates->end(),
+                   [](const Candidate& a, const Candidate& b) { return a.cost < b.cost; });
+}
+
+}  // namespace
+
+FitPlan::FitPlan(const nssm::Model& model, const nssm::LossSpec& loss, const nn::Mask& adapted)
+    : dynamics(model, loss, loss.free_start ? Restrict(model, adapted, false) : adapted, loss.free_start) {
+  if (!loss.free_start) return;
+  start.emplace(model, loss, nn::Mask(adapted.size(), false), true);
+  const nn::Mask of_encoder = Restrict(model, adapted, true);
+  if (std::find(of_encoder.begin(), of_encoder.end(), true) != of_encoder.end()) {
+    encoder.emplace(model, loss, of_encoder, false);
+  }
+}
+
+absl::Status FitPlan::CheckPrior(const GaussianPrior& prior) const {
+  const auto check = [](const std::string& name, const MatrixXd& matrix, Index rows, Index cols) {
+    if (matrix.rows() == rows && matrix.cols() == cols) return absl::OkStatus();
+    return absl::InvalidArgumentError(absl::StrCat("prior.", name, " is ", matrix.rows(), " × ", matrix.cols(), ", the adapted parameters need ",
+                                                   rows, " × ", cols));
+  };
+  const Index p = dynamics.adapted_size(), e = encoder ? encoder->adapted_size() : 0, n = start ? start->carry_size() : 0;
+  METAEKF_RETURN_IF_ERROR(check("dynamics", prior.dynamics, p, p));
+  METAEKF_RETURN_IF_ERROR(check("encoder", prior.encoder, e, e));
+  METAEKF_RETURN_IF_ERROR(check("start", prior.start, n, n));
+  METAEKF_RETURN_IF_ERROR(check("noise_variance", prior.noise_variance, dynamics.channels(), 1));
+  if (prior.examples.size() == 0) return absl::OkStatus();
+  return check("examples", prior.examples, p, prior.examples.cols());
+}
+
+Belief FitPlan::DynamicsBelief(const GaussianPrior& prior, const std::vector<double>& mean) const {
+  const Index p = dynamics.adapted_size(), n = prior.start.rows();
+  Belief belief{.mean = MeanOf(dynamics, mean), .precision = MatrixXd::Zero(p + n, p + n), .noise_variance = prior.noise_variance};
+  belief.precision.topLeftCorner(p, p) = prior.dynamics;
+  belief.precision.bottomRightCorner(n, n) = prior.start;
+  return belief;
+}
+
+Belief FitPlan::EncoderBelief(const GaussianPrior& prior, const std::vector<double>& mean) const {
+  return {.mean = MeanOf(*encoder, mean), .precision = prior.encoder, .noise_variance = prior.noise_variance};
+}
+
+absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& prior, const std::vector<double>& mean,
+                                    const Trajectory& normalised, const SystemFitOptions& options,
+                                    const std::function<bool(int, double)>& on_step) {
+  METAEKF_RETURN_IF_ERROR(plan.CheckPrior(prior));
+  const Belief belief = plan.DynamicsBelief(prior, mean);
+  const Index adapted = plan.dynamics.adapted_size();
+  METAEKF_ASSIGN_OR_RETURN(const LossData<double> data, plan.dynamics.Cut(normalised));
+  RolloutLeastSquares::Workspace workspace(plan.dynamics, data.shape);
+
+  std::vector<Candidate> candidates;
+  {
+    METAEKF_ASSIGN_OR_RETURN(const Trajectory head,
+                             data::FirstSamples(normalised, std::min(normalised.length(), kScreeningSamples)));
+    const RolloutLeastSquares& screened = plan.start ? *plan.start : plan.dynamics;
+    METAEKF_ASSIGN_OR_RETURN(const LossData<double> few, screened.Cut(plan.start ? head : normalised));
+    RolloutLeastSquares::Workspace screening(screened, few.shape);
+    const VectorXd weights = prior.noise_variance.cwiseInverse();
+    const Belief start_belief{.mean = VectorXd::Zero(prior.start.rows()), .precision = prior.start, .noise_variance = prior.noise_variance};
+    for (Index i = -1; i < prior.examples.cols(); ++i) {
+      Candidate candidate{.unknowns = belief.mean};
+      if (i >= 0) candidate.unknowns.head(adapted) = prior.examples.col(i);
+      std::vector<double> parameters = mean;
+      ScatterAdapted(plan.dynamics, candidate.unknowns, &parameters);
+      if (plan.start) {
+        const MapFit fit = FitMap(screened, few, parameters, start_belief, start_belief.mean,
+                                  {.optimiser = {.max_iterations = kScreeningSteps, .tolerance = 1e-2}}, &screening);
+        candidate.unknowns.tail(prior.start.rows()) = fit.unknowns;
+        candidate.cost = fit.cost;
+      } else {
+        candidate.cost = screened.Cost(parameters.data(), VectorXd(), weights, few, &screening);
+      }
+      candidate.cost += Penalty(belief, candidate.unknowns, adapted);
+      if (std::isfinite(candidate.cost)) candidates.push_back(std::move(candidate));
+    }
+  }
+  if (candidates.empty()) {
+    return absl::OutOfRangeError("the fit diverged: neither the meta-learned parameters nor any example simulate this system");
+  }
+  SortByCost(&candidates);
+  if (candidates.size() > kContenders) candidates.resize(kContenders);
+
+  SystemFit result{.parameters = mean};
+  bool stopped = false;
+  const auto tell = [&](int step, double cost) {
+    stopped = on_step && !on_step(step, cost);
+    return !stopped;
+  };
+  if (candidates.size() > 1) {
+    for (Candidate& candidate : candidates) {
+      const MapFit fit = FitMap(plan.dynamics, data, mean, belief, candidate.unknowns,
+                                {.optimiser = {.max_iterations = std::min(kContenderSteps, options.steps),
+                                               .tolerance = kContenderTolerance}},
+                                &workspace, tell);
+      candidate = {fit.cost, fit.unknowns};
+      if (stopped) break;
+    }
+    SortByCost(&candidates);
+  }
+  result.dynamics = FitMap(plan.dynamics, data, mean, belief, candidates[0].unknowns,
+                           {.optimiser = {.max_iterations = stopped ? 0 : options.steps, .tolerance = options.tolerance},
+                            .noise_samples = kNoiseSamples},
+                           &workspace, tell);
+  ScatterAdapted(plan.dynamics, result.dynamics.unknowns, &result.parameters);
+  if (plan.encoder && !stopped) {
+    METAEKF_ASSIGN_OR_RETURN(const LossData<double> rollouts, plan.encoder->Cut(normalised));
+    RolloutLeastSquares::Workspace encoder_workspace(*plan.encoder, rollouts.shape);
+    Belief encoder_belief = plan.EncoderBelief(prior, mean);
+    encoder_belief.noise_variance = result.dynamics.noise_variance;
+    result.encoder = FitMap(*plan.encoder, rollouts, result.parameters, encoder_belief, encoder_belief.mean,
+                            {.optimiser = {.max_iterations = options.steps, .tolerance = options.tolerance}},
+                            &encoder_workspace, tell);
+    ScatterAdapted(*plan.encoder, result.encoder->unknowns, &result.parameters);
+  }
+  return result;
+}
+
+}  // namespace metaekf::meta
