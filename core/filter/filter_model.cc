@@ -2,6 +2,7 @@
 
 #include "core/autodiff/differentiate.h"
 #include "core/autodiff/evaluate.h"
+#include "core/nssm/start_fit.h"
 
 namespace metaekf::filter {
 namespace {
@@ -51,7 +52,7 @@ Programs BuildPrograms(const nssm::Model& model, int32_t n) {
                                             : parts.Output(parts.Encode(state, input), state);
     return WithJacobian(graph, output, state);
   });
-  if (spec.is_case_one()) {
+  if (spec.is_case_one() && !spec.fits_start()) {
     Graph graph;
     const nssm::ModelGraph parts(&model, &graph, nn::BindParameters(model.layout(), kParameters, &graph));
     const Value window = graph.Input(kState, 0, model.start_size(), 1);
@@ -63,19 +64,22 @@ Programs BuildPrograms(const nssm::Model& model, int32_t n) {
 template <typename T>
 class TypedFilterModel : public FilterModel {
  public:
-  TypedFilterModel(Programs programs, const nssm::Model& model, int32_t state_size)
-      : transition_(std::move(programs.transition)),
+  TypedFilterModel(Programs programs, const nssm::Bundle& bundle, int32_t state_size)
+      : model_(bundle.model),
+        transition_(std::move(programs.transition)),
         measurement_(std::move(programs.measurement)),
         encode_(std::move(programs.encode)),
-        argument_size_(std::max<int64_t>(state_size, model.start_size())),
-        input_size_(model.spec().input_size),
-        value_size_(std::max(state_size, model.spec().output_size)) {
+        argument_size_(std::max<int64_t>(state_size, model_.start_size())),
+        input_size_(model_.spec().input_size),
+        value_size_(std::max(state_size, model_.spec().output_size)) {
     state_size_ = state_size;
+    if (model_.spec().fits_start()) prior_ = bundle.prior;
   }
 
   std::unique_ptr<Parameters> Prepare(const std::vector<double>& parameters) const override {
     auto typed = std::make_unique<TypedParameters>();
     typed->values.assign(parameters.begin(), parameters.end());
+    if (prior_) typed->exact = parameters;
     return typed;
   }
 
@@ -92,12 +96,20 @@ class TypedFilterModel : public FilterModel {
   }
 
   void Encode(const Parameters& parameters, const Eigen::Ref<const VectorXd>& window, VectorXd* latent, Scratch* scratch) const override {
-    Run(encode_, parameters, window, VectorXd(), latent, nullptr, scratch);
+    if (!prior_) return Run(encode_, parameters, window, VectorXd(), latent, nullptr, scratch);
+    TypedScratch& s = static_cast<TypedScratch&>(*scratch);
+    s.window = window;
+    *latent = s.start_fit->Fit(static_cast<const TypedParameters&>(parameters).exact.data(), s.window, 1).col(0);
+  }
+
+  MatrixXd EncodedCovariance(const Scratch& scratch) const override {
+    return static_cast<const TypedScratch&>(scratch).start_fit->Covariance(0);
   }
 
  private:
   struct TypedParameters : Parameters {
     std::vector<T> values;
+    std::vector<double> exact;  // for StartFit
   };
   struct TypedScratch : Scratch {
     explicit TypedScratch(const TypedFilterModel& owner)
@@ -105,9 +117,15 @@ class TypedFilterModel : public FilterModel {
           state(static_cast<size_t>(owner.argument_size_)),
           input(static_cast<size_t>(owner.input_size_)),
           value(static_cast<size_t>(owner.value_size_)),
-          jacobian(static_cast<size_t>(owner.value_size_) * static_cast<size_t>(owner.state_size_)) {}
+          jacobian(static_cast<size_t>(owner.value_size_) * static_cast<size_t>(owner.state_size_)) {
+      if (!owner.prior_) return;
+      start_fit.emplace(owner.model_, *owner.prior_, 1);
+      window.resize(owner.model_.start_size(), 1);
+    }
     Arena<T> arena;
     std::vector<T> state, input, value, jacobian;
+    std::optional<nssm::StartFit> start_fit;
+    MatrixXd window;
   };
 
   static void Run(const Executable<T>& executable, const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u,
@@ -129,6 +147,8 @@ class TypedFilterModel : public FilterModel {
     }
   }
 
+  const nssm::Model model_;
+  std::optional<nssm::GaussianPrior> prior_;
   Executable<T> transition_, measurement_, encode_;
   int64_t argument_size_;
   int32_t input_size_, value_size_;
@@ -136,14 +156,15 @@ class TypedFilterModel : public FilterModel {
 
 }  // namespace
 
-std::unique_ptr<FilterModel> FilterModel::Create(const nssm::Model& model) {
+std::unique_ptr<FilterModel> FilterModel::Create(const nssm::Bundle& bundle) {
+  const nssm::Model& model = bundle.model;
   const nssm::ModelSpec& spec = model.spec();
   const int32_t n = spec.is_case_one() ? spec.latent_size : spec.state_size;
   Programs programs = BuildPrograms(model, n);
   if (spec.precision == nssm::Precision::kFloat32) {
-    return std::make_unique<TypedFilterModel<float>>(std::move(programs), model, n);
+    return std::make_unique<TypedFilterModel<float>>(std::move(programs), bundle, n);
   }
-  return std::make_unique<TypedFilterModel<double>>(std::move(programs), model, n);
+  return std::make_unique<TypedFilterModel<double>>(std::move(programs), bundle, n);
 }
 
 }  // namespace metaekf::filter

@@ -29,7 +29,8 @@ class FilterModel {
     virtual ~Scratch() = default;
   };
 
-  static std::unique_ptr<FilterModel> Create(const nssm::Model& model);
+  /// Takes the architecture, and where the start is fitted the prior; not the parameters.
+  static std::unique_ptr<FilterModel> Create(const nssm::Bundle& bundle);
   virtual ~FilterModel() = default;
 
   virtual std::unique_ptr<Parameters> Prepare(const std::vector<double>& parameters) const = 0;
@@ -41,9 +42,12 @@ class FilterModel {
   /// h and H = ∂h/∂x at (x, u). @param H  n_y × n.
   virtual void Measurement(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
                            Eigen::VectorXd* h, Eigen::MatrixXd* H, Scratch* scratch) const = 0;
-  /// Case I: ψ = 𝓔(window), samples oldest first, each [u; y].
+  /// Case I: ψ = 𝓔(window), samples oldest first, each [u; y]; StartFit where the start is fitted.
   virtual void Encode(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& window, Eigen::VectorXd* latent,
                       Scratch* scratch) const = 0;
+
+  /// Covariance of the latent that the last Encode with this scratch gave; only where the start is fitted.
+  virtual Eigen::MatrixXd EncodedCovariance(const Scratch& scratch) const = 0;
 
   int32_t state_size() const { return state_size_; }
 

@@ -12,15 +12,18 @@ constexpr double kFloor = 1e-8;  // of a channel's variance, which is 1 in norma
 
 }  // namespace
 
-NoiseEstimate::NoiseEstimate(const nssm::Model& model)
-    : model_(model), filter_model_(FilterModel::Create(model)), scratch_(filter_model_->MakeScratch()) {
-  const Index n = filter_model_->state_size(), n_y = model.spec().output_size;
+NoiseEstimate::NoiseEstimate(const nssm::Bundle& bundle)
+    : bundle_(bundle),
+      filter_model_(FilterModel::Create(bundle)),
+      scratch_(filter_model_->MakeScratch()) {
+  const Index n = filter_model_->state_size(), n_y = bundle.model.spec().output_size;
   process_ = MatrixXd::Zero(n, n);
   measurement_ = MatrixXd::Zero(n_y, n_y);
+  fitted_ = MatrixXd::Zero(n, n);
 }
 
 void NoiseEstimate::Add(const std::vector<double>& parameters, const data::Trajectory& normalised) {
-  const nssm::ModelSpec& spec = model_.spec();
+  const nssm::ModelSpec& spec = bundle_.model.spec();
   const auto prepared = filter_model_->Prepare(parameters);
   const Index n = filter_model_->state_size(), n_y = spec.output_size, warmup = spec.warmup();
   const Index window = warmup * (spec.input_size + n_y);
@@ -34,6 +37,10 @@ void NoiseEstimate::Add(const std::vector<double>& parameters, const data::Traje
       at += n_y;
     }
     filter_model_->Encode(*prepared, values, &latent, scratch_.get());
+    if (spec.fits_start()) {
+      fitted_ += filter_model_->EncodedCovariance(*scratch_);
+      ++fitted_count_;
+    }
     return latent;
   };
   VectorXd f(n), h(n_y);
@@ -61,7 +68,8 @@ nssm::FilterNoise NoiseEstimate::Result(const data::Normaliser& normaliser) cons
     return MatrixXd(scale.asDiagonal() * cov * scale.asDiagonal());
   };
   const MatrixXd R_physical = physical(R, normaliser.outputs.scale);
-  if (model_.spec().is_case_one()) return {Q, R_physical, Q};
+  if (fitted_count_ > 0) return {Q, R_physical, fitted_ / static_cast<double>(fitted_count_)};
+  if (bundle_.model.spec().is_case_one()) return {Q, R_physical, Q};
   const VectorXd& scale = normaliser.states.scale;
   return {physical(Q, scale), R_physical, MatrixXd(scale.cwiseAbs2().asDiagonal())};
 }

@@ -101,7 +101,6 @@ nssm::GaussianPrior ProximalPrior(const FitPlan& plan, double proximal) {
   const auto identity = [](Eigen::Index n) { return Eigen::MatrixXd(Eigen::MatrixXd::Identity(n, n)); };
   nssm::GaussianPrior prior{.dynamics = proximal * identity(plan.dynamics.adapted_size()),
                             .noise_variance = Eigen::VectorXd::Constant(plan.dynamics.channels(), kUnknownNoiseVariance)};
-  if (plan.encoder) prior.encoder = proximal * identity(plan.encoder->adapted_size());
   if (plan.start) prior.start = identity(plan.start->carry_size());
   return prior;
 }
@@ -119,20 +118,24 @@ absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const ns
   const auto per_value = [&](double cost) { return 2 * cost / values; };
   bool stopped = false;
   int32_t step = 0;
-  METAEKF_ASSIGN_OR_RETURN(SystemFit fit, FitSystem(plan, prior, bundle.parameters, context, {.steps = steps}, [&](int, double cost) {
+  const auto tell = [&](int, double cost) {
     step = std::min(step + 1, steps);
     stopped = on_step && !on_step({.step = step, .steps = steps, .loss = per_value(cost)});
     return !stopped;
-  }));
+  };
+  METAEKF_ASSIGN_OR_RETURN(
+      SystemFit fit, options.method == AdaptationMethod::kFromScratch
+                         ? FitFromScratch(plan, bundle.model, loss, context, {.seed = options.seed, .steps = steps}, tell)
+                         : FitSystem(plan, prior, bundle.parameters, context, {.steps = steps}, tell));
   if (stopped) return absl::CancelledError("the adaptation was cancelled");
-  FitResult result{.parameters = std::move(fit.parameters), .information = std::move(fit.dynamics.information)};
+  FitResult result{.parameters = std::move(fit.parameters), .information = std::move(fit.fit.information)};
   nssm::RoundToPrecision(bundle.model.spec().precision, &result.parameters);
   nssm::RolloutLeastSquares::Workspace workspace(plan.dynamics, data.shape);
   const Eigen::VectorXd weights = prior.noise_variance.cwiseInverse();
   const auto loss_at = [&](const std::vector<double>& parameters, const Eigen::VectorXd& start) {
     return per_value(plan.dynamics.Cost(parameters.data(), start, weights, data, &workspace));
   };
-  const Eigen::VectorXd start = fit.dynamics.unknowns.tail(prior.start.rows());
+  const Eigen::VectorXd start = fit.fit.unknowns.tail(prior.start.rows());
   result.loss_before = loss_at(bundle.parameters, Eigen::VectorXd::Zero(start.size()));
   result.loss_after = loss_at(result.parameters, start);
   return result;
@@ -142,7 +145,7 @@ absl::StatusOr<FitResult> FitAnyPrecision(const Bundle& bundle, const nssm::Loss
                                           const nn::Mask& mask, const AdaptationOptions& options,
                                           const OnStep& on_step) {
   METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, context));
-  if (options.method == AdaptationMethod::kLevenbergMarquardt) {
+  if (options.method == AdaptationMethod::kLevenbergMarquardt || bundle.model.spec().fits_start()) {
     return FitByLevenbergMarquardt(bundle, loss, normalised, mask, options, on_step);
   }
   return bundle.model.spec().precision == nssm::Precision::kFloat32
@@ -185,6 +188,9 @@ absl::StatusOr<Problem> Pose(const Bundle& bundle, const Trajectory& context, co
   const nssm::ModelSpec& spec = bundle.model.spec();
   METAEKF_ASSIGN_OR_RETURN(const TrainingSpec training, ReadTrainingSpec(bundle.training));
   METAEKF_RETURN_IF_ERROR(nssm::CheckChannels(bundle, context, !spec.is_case_one()));
+  if (spec.fits_start() && (options.method == AdaptationMethod::kGradientDescent || options.method == AdaptationMethod::kAdam)) {
+    return absl::InvalidArgumentError("method: the start of the model is fitted, so it adapts by Levenberg–Marquardt (map) or from scratch");
+  }
   METAEKF_RETURN_IF_ERROR(CheckFinite("input", context.inputs));
   METAEKF_RETURN_IF_ERROR(CheckFinite("output", context.outputs));
   if (!spec.is_case_one()) METAEKF_RETURN_IF_ERROR(CheckFinite("state", context.states));
@@ -236,7 +242,7 @@ absl::StatusOr<AdaptationOptions> DefaultAdaptation(const Bundle& bundle, std::o
   const AdaptationMethod trained_for = MethodOf(options.inner_loop.optimiser);
   options.method = method.value_or(trained_for);
   if (options.method == AdaptationMethod::kFromScratch) {
-    options.inner_loop.steps *= kScratchSteps;
+    if (!bundle.model.spec().fits_start()) options.inner_loop.steps *= kScratchSteps;
     options.inner_loop.learning_rate = kScratchLearningRate;
     options.inner_loop.adapted_mask = "*";
   } else if (options.method == AdaptationMethod::kAdam && trained_for != AdaptationMethod::kAdam) {

@@ -9,7 +9,6 @@
 #include "core/base/status.h"
 #include "core/data/split.h"
 #include "core/meta/fit_plan.h"
-#include "core/meta/linear_start.h"
 
 namespace metaekf::meta {
 namespace {
@@ -22,13 +21,9 @@ using nssm::GaussianPrior;
 using nssm::LossData;
 using nssm::RolloutLeastSquares;
 
-constexpr double kFirstPrecision = 1e-6;  // of the first fit, which knows nothing: residuals count as they are
 constexpr double kTolerance = 1e-5;
 constexpr double kStalled = 6;            // times the median mean square of the residuals
-constexpr int32_t kEncoderRounds = 3;
-constexpr double kEncoderStd = 0.3;       // of the first encoder round
 constexpr size_t kBatch = 8;              // systems between two calls of on_step
-constexpr int kHorizonGrowth = 4;         // of the first fit's rollouts, from one stage to the next
 
 MatrixXd Inverse(const MatrixXd& positive_definite) {
   return positive_definite.llt().solve(MatrixXd::Identity(positive_definite.rows(), positive_definite.cols()));
@@ -79,7 +74,7 @@ class Learner {
         workspaces_(executor->concurrency()) {}
 
   absl::StatusOr<LearnedPrior> Run() {
-    METAEKF_ASSIGN_OR_RETURN(dynamics_data_, CutAll(plan_.dynamics));
+    METAEKF_ASSIGN_OR_RETURN(data_, CutAll(plan_.dynamics));
     if (state_.values.empty()) {
       state_.iteration = 0;
       METAEKF_RETURN_IF_ERROR(FirstFit());
@@ -88,18 +83,16 @@ class Learner {
     }
     for (; round_ <= options_.rounds; ++round_) {
       const int32_t steps = round_ == 0 ? options_.first_steps : options_.round_steps;
-      METAEKF_RETURN_IF_ERROR(Round(plan_.dynamics, dynamics_data_, steps, &dynamics_));
+      METAEKF_RETURN_IF_ERROR(Round(steps));
       METAEKF_RETURN_IF_ERROR(Validate());
       Save(round_ + 1);
     }
-    if (plan_.encoder) METAEKF_RETURN_IF_ERROR(LearnEncoder());
     return std::move(best_);
   }
 
  private:
   int32_t Iterations() const {
-    const int32_t rounds = options_.rounds + 1 + (plan_.encoder ? kEncoderRounds : 0);
-    return options_.restarts + rounds * static_cast<int32_t>(systems_.training.size());
+    return options_.restarts + (options_.rounds + 1) * static_cast<int32_t>(systems_.training.size());
   }
 
   absl::StatusOr<std::vector<LossData<double>>> CutAll(const RolloutLeastSquares& problem) const {
@@ -120,77 +113,23 @@ class Learner {
 
   // ---- the first fit ----
 
-  std::vector<double> StartOf(int32_t restart) const {
-    const uint64_t seed = spec_.seed + static_cast<uint64_t>(restart);
-    absl::StatusOr<std::vector<double>> linear = LinearStart(model_, systems_.training[0], seed);
-    return linear.ok() ? *std::move(linear) : model_.InitialParameters(seed);
-  }
-
-  /// One system from one start. Rollouts from measured or encoded starts grow to their full length.
-  MapFit FitFrom(const std::vector<double>& parameters) const {
-    VectorXd unknowns = VectorXd::Zero(plan_.dynamics.unknowns());
-    unknowns.head(plan_.dynamics.adapted_size()) = GatherAdapted(plan_.dynamics, parameters);
-    const Index n = unknowns.size();
-    const Belief belief{.mean = VectorXd::Zero(n),
-                        .precision = kFirstPrecision * MatrixXd::Identity(n, n),
-                        .noise_variance = ChannelWeights().cwiseInverse()};
-    const auto fit = [&](const RolloutLeastSquares& problem, const LossData<double>& data) {
-      RolloutLeastSquares::Workspace workspace(problem, data.shape);
-      return FitMap(problem, data, parameters, belief, unknowns,
-                    {.optimiser = {.max_iterations = options_.first_steps, .tolerance = kTolerance}}, &workspace);
-    };
-    if (!spec_.loss.free_start) {
-      nssm::LossSpec loss = spec_.loss;
-      const int32_t full = dynamics_data_[0].shape.horizon;
-      for (loss.horizon = 1; loss.horizon < full; loss.horizon *= kHorizonGrowth) {
-        const FitPlan shorter(model_, loss, MaskOfPlan());
-        const absl::StatusOr<LossData<double>> data = shorter.dynamics.Cut(systems_.training[0]);
-        if (data.ok()) unknowns = fit(shorter.dynamics, *data).unknowns;
-      }
-    }
-    return fit(plan_.dynamics, dynamics_data_[0]);
-  }
-
-  nn::Mask MaskOfPlan() const {
-    nn::Mask mask(model_.layout().tensors().size(), false);
-    for (size_t i = 0; i < mask.size(); ++i) {
-      for (const auto& [offset, size] : plan_.dynamics.adapted()) {
-        if (model_.layout().tensors()[i].offset == offset) mask[i] = true;
-      }
-    }
-    return mask;
-  }
-
-  /// The loss's weights of the channels.
-  VectorXd ChannelWeights() const {
-    VectorXd weights = VectorXd::Constant(plan_.dynamics.channels(), spec_.loss.output_weight);
-    weights.head(plan_.dynamics.channels() - model_.spec().output_size).setConstant(spec_.loss.state_weight);
-    return weights;
-  }
-
   absl::Status FirstFit() {
-    std::vector<MapFit> fits(static_cast<size_t>(options_.restarts));
-    executor_.ParallelFor(fits.size(), [&](size_t i, size_t) { fits[i] = FitFrom(StartOf(static_cast<int32_t>(i))); });
-    const auto best = std::min_element(fits.begin(), fits.end(), [](const MapFit& a, const MapFit& b) {
-      return !(b.cost < a.cost) && std::isfinite(a.cost);
-    });
-    if (!std::isfinite(best->cost)) {
-      return absl::OutOfRangeError("no start of the first fit simulates its system; shorter rollouts or another seed may help");
-    }
-    const Index p = plan_.dynamics.adapted_size(), n = best->unknowns.size() - p;
-    dynamics_.belief.mean = best->unknowns;
-    dynamics_.belief.mean.tail(n).setZero();
+    METAEKF_ASSIGN_OR_RETURN(
+        const SystemFit first,
+        FitFromScratch(plan_, model_, spec_.loss, systems_.training[0],
+                       {.seed = spec_.seed, .restarts = options_.restarts, .steps = options_.first_steps}, nullptr, &executor_));
+    const Index p = plan_.dynamics.adapted_size(), n = first.fit.unknowns.size() - p;
+    Belief& belief = population_.belief;
+    belief.mean = first.fit.unknowns;
+    belief.mean.tail(n).setZero();
     VectorXd precision = VectorXd::Constant(p + n, 1 / (options_.initial_std * options_.initial_std));
     precision.tail(n).setOnes();  // latents are of the order of one
-    dynamics_.belief.precision = precision.asDiagonal();
-    dynamics_.belief.noise_variance = best->channel_squares / static_cast<double>(Samples(dynamics_data_[0]));
-    for (Index c = 0; c < dynamics_.belief.noise_variance.size(); ++c) {
-      if (ChannelWeights()[c] == 0) dynamics_.belief.noise_variance[c] = std::numeric_limits<double>::infinity();
-    }
-    dynamics_.fits.assign(systems_.training.size(), best->unknowns);
-    dynamics_.accepted.assign(systems_.training.size(), true);
+    belief.precision = precision.asDiagonal();
+    belief.noise_variance = first.fit.noise_variance;
+    population_.fits.assign(systems_.training.size(), first.fit.unknowns);
+    population_.accepted.assign(systems_.training.size(), true);
     state_.best_validation_loss = state_.validation_loss = std::numeric_limits<double>::infinity();
-    METAEKF_RETURN_IF_ERROR(Tell(fits.size()));
+    METAEKF_RETURN_IF_ERROR(Tell(static_cast<size_t>(options_.restarts)));
     Save(0);
     return absl::OkStatus();
   }
@@ -199,31 +138,28 @@ class Learner {
 
   // ---- expectation and maximisation ----
 
-  absl::Status Round(const RolloutLeastSquares& problem, const std::vector<LossData<double>>& data, int32_t steps,
-                     Population* population) {
-    const size_t count = data.size();
-    const Belief& belief = population->belief;
+  absl::Status Round(int32_t steps) {
+    const size_t count = data_.size();
+    const Belief& belief = population_.belief;
     std::vector<MatrixXd> covariances(count);
     std::vector<double> mean_squares(count);
     std::vector<VectorXd> variances(count);
-    const GaussianPrior helped = PriorOf(*population);
+    const LearnedPrior current = Current();
     for (size_t first = 0; first < count; first += kBatch) {
       const size_t batch = std::min(kBatch, count - first);
       executor_.ParallelFor(batch, [&](size_t i, size_t slot) {
         const size_t s = first + i;
-        MapFit fit = FitMap(problem, data[s], ParametersOf(s, problem), belief, population->fits[s],
+        MapFit fit = FitMap(plan_.dynamics, data_[s], current.parameters, belief, population_.fits[s],
                             {.optimiser = {.max_iterations = steps, .tolerance = kTolerance}},
-                            workspaces_[slot].For(problem, data[s].shape));
-        if (!population->accepted[s] && &problem == &plan_.dynamics) {
-          std::vector<double> mean = model_.InitialParameters(spec_.seed);
-          ScatterAdapted(problem, belief.mean, &mean);
-          absl::StatusOr<SystemFit> other = FitSystem(plan_, helped, mean, systems_.training[s],
+                            workspaces_[slot].For(plan_.dynamics, data_[s].shape));
+        if (!population_.accepted[s]) {
+          absl::StatusOr<SystemFit> other = FitSystem(plan_, current.prior, current.parameters, systems_.training[s],
                                                       {.steps = steps, .tolerance = kTolerance}, nullptr);
-          if (other.ok() && other->dynamics.cost < fit.cost) fit = std::move(other->dynamics);
+          if (other.ok() && other->fit.cost < fit.cost) fit = std::move(other->fit);
         }
-        population->fits[s] = fit.unknowns;
+        population_.fits[s] = fit.unknowns;
         covariances[s] = Inverse(fit.information);
-        const double samples = static_cast<double>(Samples(data[s]));
+        const double samples = static_cast<double>(Samples(data_[s]));
         const double determined =
             static_cast<double>(fit.unknowns.size()) - (covariances[s] * belief.precision).trace();
         const double channels = static_cast<double>(fit.channel_squares.size());
@@ -232,8 +168,8 @@ class Learner {
       });
       METAEKF_RETURN_IF_ERROR(Tell(batch));
     }
-    Maximise(mean_squares, variances, covariances, problem.adapted_size(), population);
     state_.training_loss = Median(mean_squares) * belief.noise_variance.minCoeff();
+    Maximise(mean_squares, variances, covariances, plan_.dynamics.adapted_size(), &population_);
     return absl::OkStatus();
   }
 
@@ -274,52 +210,38 @@ class Learner {
     }
   }
 
-  /// ω of system s as far as `problem` does not fit it.
-  std::vector<double> ParametersOf(size_t s, const RolloutLeastSquares& problem) const {
-    std::vector<double> parameters = model_.InitialParameters(spec_.seed);
-    if (&problem != &plan_.dynamics) ScatterAdapted(plan_.dynamics, dynamics_.fits[s], &parameters);
-    return parameters;
-  }
-
-  /// The dynamics' part of a prior.
-  GaussianPrior PriorOf(const Population& population) const {
-    const Index p = plan_.dynamics.adapted_size(), n = population.belief.mean.size() - p;
-    GaussianPrior prior;
-    if (&population != &dynamics_) return prior;
-    prior.dynamics = population.belief.precision.topLeftCorner(p, p);
-    prior.start = population.belief.precision.bottomRightCorner(n, n);
-    prior.noise_variance = population.belief.noise_variance;
-    if (plan_.encoder) {
-      const Index e = plan_.encoder->adapted_size();
-      prior.encoder = MatrixXd::Identity(e, e) / (kEncoderStd * kEncoderStd);
-    }
+  /// What the population says of a new system.
+  LearnedPrior Current() const {
+    const Index p = plan_.dynamics.adapted_size(), n = population_.belief.mean.size() - p;
+    LearnedPrior current{.parameters = model_.InitialParameters(spec_.seed)};
+    ScatterAdapted(plan_.dynamics, population_.belief.mean, &current.parameters);
+    GaussianPrior& prior = current.prior;
+    prior.dynamics = population_.belief.precision.topLeftCorner(p, p);
+    prior.start = population_.belief.precision.bottomRightCorner(n, n);
+    prior.noise_variance = population_.belief.noise_variance;
     std::vector<Index> accepted;
-    for (size_t s = 0; s < population.fits.size(); ++s) {
-      if (population.accepted[s]) accepted.push_back(static_cast<Index>(s));
+    for (size_t s = 0; s < population_.fits.size(); ++s) {
+      if (population_.accepted[s]) accepted.push_back(static_cast<Index>(s));
     }
     prior.examples.resize(p, static_cast<Index>(accepted.size()));
     for (Index i = 0; i < prior.examples.cols(); ++i) {
-      prior.examples.col(i) = population.fits[static_cast<size_t>(accepted[static_cast<size_t>(i)])].head(p);
+      prior.examples.col(i) = population_.fits[static_cast<size_t>(accepted[static_cast<size_t>(i)])].head(p);
     }
-    return prior;
+    return current;
   }
 
   // ---- validation ----
 
   /// Free-run error on what follows a context, geometric mean over the held-out systems; keeps the best prior.
   absl::Status Validate() {
-    LearnedPrior current{.parameters = model_.InitialParameters(spec_.seed), .prior = PriorOf(dynamics_)};
-    ScatterAdapted(plan_.dynamics, dynamics_.belief.mean, &current.parameters);
+    LearnedPrior current = Current();
     if (systems_.validation.empty()) {
       best_ = std::move(current);
       return absl::OkStatus();
     }
     std::vector<double> losses(systems_.validation.size());
-    const FitPlan dynamics_only(model_, spec_.loss, MaskOfPlan());
-    GaussianPrior prior = current.prior;
-    prior.encoder.resize(0, 0);
     executor_.ParallelFor(losses.size(), [&](size_t i, size_t) {
-      losses[i] = std::log(TargetLoss(dynamics_only, prior, current.parameters, systems_.validation[i]));
+      losses[i] = std::log(TargetLoss(current, systems_.validation[i]));
     });
     double sum = 0;
     for (const double loss : losses) sum += loss;
@@ -332,45 +254,24 @@ class Learner {
   }
 
   /// Mean square error of the outputs after a context that the system was fitted to.
-  double TargetLoss(const FitPlan& plan, const GaussianPrior& prior, const std::vector<double>& mean,
-                    const Trajectory& system) const {
+  double TargetLoss(const LearnedPrior& learned, const Trajectory& system) const {
     constexpr double kHopeless = 1;  // the variance of the normalised outputs
     const Index context = std::min<Index>(spec_.context_samples, system.length() / 2);
     const Index end = std::min<Index>(context + spec_.target_samples, system.length());
     const auto head = data::FirstSamples(system, context), both = data::FirstSamples(system, end);
     if (!head.ok() || !both.ok()) return kHopeless;
-    const auto fit = FitSystem(plan, prior, mean, *head, {.steps = spec_.adaptation.steps}, nullptr);
-    const auto data = plan.dynamics.Cut(spec_.loss.free_start ? *both : *data::SamplesFrom(*both, context));
+    const auto fit = FitSystem(plan_, learned.prior, learned.parameters, *head, {.steps = spec_.adaptation.steps}, nullptr);
+    const auto data = plan_.dynamics.Cut(spec_.model.fits_start() ? *both : *data::SamplesFrom(*both, context));
     if (!fit.ok() || !data.ok()) return kHopeless;
-    RolloutLeastSquares::Workspace workspace(plan.dynamics, data->shape);
-    const VectorXd start = fit->dynamics.unknowns.tail(prior.start.rows());
-    const MatrixXd predictions = plan.dynamics.Predictions(fit->parameters.data(), start, *data, &workspace);
+    RolloutLeastSquares::Workspace workspace(plan_.dynamics, data->shape);
+    const VectorXd start = fit->fit.unknowns.tail(learned.prior.start.rows());
+    const MatrixXd predictions = plan_.dynamics.Predictions(fit->parameters.data(), start, *data, &workspace);
     const Index n_y = model_.spec().output_size;
     const Eigen::Map<const MatrixXd> measured(data->outputs.data(), n_y, predictions.cols());
-    const Index from = spec_.loss.free_start ? context - 1 : 0;
+    const Index from = spec_.model.fits_start() ? context - 1 : 0;
     const Index count = predictions.cols() - from;
     const double loss = (predictions.bottomRows(n_y) - measured).rightCols(count).squaredNorm() / static_cast<double>(count * n_y);
     return std::isfinite(loss) ? std::min(loss, kHopeless) : kHopeless;
-  }
-
-  // ---- the encoder ----
-
-  absl::Status LearnEncoder() {
-    const RolloutLeastSquares& problem = *plan_.encoder;
-    METAEKF_ASSIGN_OR_RETURN(const std::vector<LossData<double>> data, CutAll(problem));
-    const Index size = problem.unknowns();
-    Population encoder;
-    encoder.belief = {.mean = GatherAdapted(problem, model_.InitialParameters(spec_.seed)),
-                      .precision = MatrixXd::Identity(size, size) / (kEncoderStd * kEncoderStd),
-                      .noise_variance = dynamics_.belief.noise_variance};
-    encoder.fits.assign(data.size(), encoder.belief.mean);
-    encoder.accepted.assign(data.size(), true);
-    for (int32_t round = 0; round < kEncoderRounds; ++round) {
-      METAEKF_RETURN_IF_ERROR(Round(problem, data, round == 0 ? options_.first_steps : options_.round_steps, &encoder));
-    }
-    ScatterAdapted(problem, encoder.belief.mean, &best_.parameters);
-    best_.prior.encoder = encoder.belief.precision;
-    return absl::OkStatus();
   }
 
   // ---- checkpoints ----
@@ -380,12 +281,13 @@ class Learner {
   /// Checkpoints hold what a round begins with; one that was interrupted is begun again.
   void Save(int32_t next_round) {
     std::vector<double> fits, accepted;
-    for (const VectorXd& fit : dynamics_.fits) fits.insert(fits.end(), fit.begin(), fit.end());
-    for (const bool flag : dynamics_.accepted) accepted.push_back(flag ? 1 : 0);
-    state_.values = {{"round", {static_cast<double>(next_round), static_cast<double>(state_.iteration)}},
-                     {"mean", Flat(dynamics_.belief.mean)},
-                     {"precision", Flat(dynamics_.belief.precision)},
-                     {"noise_precision", Flat(dynamics_.belief.noise_variance.cwiseInverse())},
+    for (const VectorXd& fit : population_.fits) fits.insert(fits.end(), fit.begin(), fit.end());
+    for (const bool flag : population_.accepted) accepted.push_back(flag ? 1 : 0);
+    // The inverse of a loss that may be infinite still.
+    state_.values = {{"round", {static_cast<double>(next_round), static_cast<double>(state_.iteration), 1 / state_.best_validation_loss}},
+                     {"mean", Flat(population_.belief.mean)},
+                     {"precision", Flat(population_.belief.precision)},
+                     {"noise_precision", Flat(population_.belief.noise_variance.cwiseInverse())},
                      {"fits", fits},
                      {"accepted", accepted}};
     if (best_.parameters.empty()) return;
@@ -409,17 +311,18 @@ class Learner {
       }
       return Eigen::Map<const MatrixXd>(values.data(), rows, cols);
     };
-    const MatrixXd round = matrix("round", 2, 1);
-    dynamics_.belief = {.mean = matrix("mean", size, 1),
+    const MatrixXd round = matrix("round", 3, 1);
+    population_.belief = {.mean = matrix("mean", size, 1),
                         .precision = matrix("precision", size, size),
                         .noise_variance = matrix("noise_precision", channels, 1).cwiseInverse()};
     const MatrixXd fits = matrix("fits", size, systems), accepted = matrix("accepted", systems, 1);
     for (Index s = 0; s < systems; ++s) {
-      dynamics_.fits.push_back(fits.col(s));
-      dynamics_.accepted.push_back(accepted(s, 0) != 0);
+      population_.fits.push_back(fits.col(s));
+      population_.accepted.push_back(accepted(s, 0) != 0);
     }
     round_ = static_cast<int32_t>(round(0, 0));
     state_.iteration = static_cast<int32_t>(round(1, 0));
+    state_.best_validation_loss = 1 / round(2, 0);
     if (round_ > 0) {
       best_.parameters = state_.values["best_parameters"];
       best_.prior.dynamics = matrix("best_dynamics", p, p);
@@ -442,8 +345,8 @@ class Learner {
   TrainingState& state_;
   const OnTrainingStep& on_step_;
   std::vector<SlotWorkspace> workspaces_;
-  std::vector<LossData<double>> dynamics_data_;
-  Population dynamics_;
+  std::vector<LossData<double>> data_;
+  Population population_;
   int32_t round_ = 0;
   LearnedPrior best_;
 };

@@ -19,8 +19,7 @@ struct LearnedPrior {
 ///
 /// The first ω₀ is the best of several fits of one system, each from a start of its own. Systems whose fit has stalled,
 /// recognised by residuals far above the others', do not count in the M-step and begin the next round from the fits of
-/// others. With a free start the encoder follows in rounds of its own. Held-out systems judge every round: the best prior
-/// is returned.
+/// others. Held-out systems judge every round: the best prior is returned.
 ///
 /// Errors: Cancelled if on_step said so; OutOfRange if no start of the first fit simulates its system.
 absl::StatusOr<LearnedPrior> LearnGaussianPrior(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,

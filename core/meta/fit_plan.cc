@@ -1,10 +1,12 @@
 #include "core/meta/fit_plan.h"
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 
 #include "core/base/status.h"
 #include "core/data/split.h"
+#include "core/meta/linear_start.h"
 
 namespace metaekf::meta {
 
@@ -23,17 +25,10 @@ constexpr int kScreeningSteps = 4;         // for c₀ of each
 constexpr size_t kContenders = 3;          // starts that go on
 constexpr int kContenderSteps = 10;
 constexpr double kContenderTolerance = 1e-3;
+constexpr double kFromScratchPrecision = 1e-6;  // knows nothing
+constexpr double kFromScratchTolerance = 1e-5;
+constexpr int kHorizonGrowth = 4;          // from one stage to the next
 constexpr double kNoiseSamples = 200;      // that the fleet's noise variance counts for beside the system's own
-
-bool IsEncoder(const nn::Tensor& tensor) { return tensor.name.rfind("encoder.", 0) == 0; }
-
-nn::Mask Restrict(const nssm::Model& model, const nn::Mask& mask, bool encoder) {
-  nn::Mask restricted = mask;
-  for (size_t i = 0; i < mask.size(); ++i) {
-    if (IsEncoder(model.layout().tensors()[i]) != encoder) restricted[i] = false;
-  }
-  return restricted;
-}
 
 VectorXd MeanOf(const RolloutLeastSquares& problem, const std::vector<double>& mean) {
   VectorXd unknowns = VectorXd::Zero(problem.unknowns());
@@ -61,13 +56,8 @@ void SortByCost(std::vector<Candidate>* candidates) {
 }  // namespace
 
 FitPlan::FitPlan(const nssm::Model& model, const nssm::LossSpec& loss, const nn::Mask& adapted)
-    : dynamics(model, loss, loss.free_start ? Restrict(model, adapted, false) : adapted, loss.free_start) {
-  if (!loss.free_start) return;
-  start.emplace(model, loss, nn::Mask(adapted.size(), false), true);
-  const nn::Mask of_encoder = Restrict(model, adapted, true);
-  if (std::find(of_encoder.begin(), of_encoder.end(), true) != of_encoder.end()) {
-    encoder.emplace(model, loss, of_encoder, false);
-  }
+    : dynamics(model, loss, adapted, model.spec().fits_start()) {
+  if (model.spec().fits_start()) start.emplace(model, loss, nn::Mask(adapted.size(), false), true);
 }
 
 absl::Status FitPlan::CheckPrior(const GaussianPrior& prior) const {
@@ -76,16 +66,15 @@ absl::Status FitPlan::CheckPrior(const GaussianPrior& prior) const {
     return absl::InvalidArgumentError(absl::StrCat("prior.", name, " is ", matrix.rows(), " × ", matrix.cols(), ", the adapted parameters need ",
                                                    rows, " × ", cols));
   };
-  const Index p = dynamics.adapted_size(), e = encoder ? encoder->adapted_size() : 0, n = start ? start->carry_size() : 0;
+  const Index p = dynamics.adapted_size(), n = start ? start->carry_size() : 0;
   METAEKF_RETURN_IF_ERROR(check("dynamics", prior.dynamics, p, p));
-  METAEKF_RETURN_IF_ERROR(check("encoder", prior.encoder, e, e));
   METAEKF_RETURN_IF_ERROR(check("start", prior.start, n, n));
   METAEKF_RETURN_IF_ERROR(check("noise_variance", prior.noise_variance, dynamics.channels(), 1));
   if (prior.examples.size() == 0) return absl::OkStatus();
   return check("examples", prior.examples, p, prior.examples.cols());
 }
 
-Belief FitPlan::DynamicsBelief(const GaussianPrior& prior, const std::vector<double>& mean) const {
+Belief FitPlan::BeliefOf(const GaussianPrior& prior, const std::vector<double>& mean) const {
   const Index p = dynamics.adapted_size(), n = prior.start.rows();
   Belief belief{.mean = MeanOf(dynamics, mean), .precision = MatrixXd::Zero(p + n, p + n), .noise_variance = prior.noise_variance};
   belief.precision.topLeftCorner(p, p) = prior.dynamics;
@@ -93,15 +82,11 @@ Belief FitPlan::DynamicsBelief(const GaussianPrior& prior, const std::vector<dou
   return belief;
 }
 
-Belief FitPlan::EncoderBelief(const GaussianPrior& prior, const std::vector<double>& mean) const {
-  return {.mean = MeanOf(*encoder, mean), .precision = prior.encoder, .noise_variance = prior.noise_variance};
-}
-
 absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& prior, const std::vector<double>& mean,
                                     const Trajectory& normalised, const SystemFitOptions& options,
                                     const std::function<bool(int, double)>& on_step) {
   METAEKF_RETURN_IF_ERROR(plan.CheckPrior(prior));
-  const Belief belief = plan.DynamicsBelief(prior, mean);
+  const Belief belief = plan.BeliefOf(prior, mean);
   const Index adapted = plan.dynamics.adapted_size();
   METAEKF_ASSIGN_OR_RETURN(const LossData<double> data, plan.dynamics.Cut(normalised));
   RolloutLeastSquares::Workspace workspace(plan.dynamics, data.shape);
@@ -155,20 +140,70 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
     }
     SortByCost(&candidates);
   }
-  result.dynamics = FitMap(plan.dynamics, data, mean, belief, candidates[0].unknowns,
+  result.fit = FitMap(plan.dynamics, data, mean, belief, candidates[0].unknowns,
                            {.optimiser = {.max_iterations = stopped ? 0 : options.steps, .tolerance = options.tolerance},
                             .noise_samples = kNoiseSamples},
                            &workspace, tell);
-  ScatterAdapted(plan.dynamics, result.dynamics.unknowns, &result.parameters);
-  if (plan.encoder && !stopped) {
-    METAEKF_ASSIGN_OR_RETURN(const LossData<double> rollouts, plan.encoder->Cut(normalised));
-    RolloutLeastSquares::Workspace encoder_workspace(*plan.encoder, rollouts.shape);
-    Belief encoder_belief = plan.EncoderBelief(prior, mean);
-    encoder_belief.noise_variance = result.dynamics.noise_variance;
-    result.encoder = FitMap(*plan.encoder, rollouts, result.parameters, encoder_belief, encoder_belief.mean,
-                            {.optimiser = {.max_iterations = options.steps, .tolerance = options.tolerance}},
-                            &encoder_workspace, tell);
-    ScatterAdapted(*plan.encoder, result.encoder->unknowns, &result.parameters);
+  ScatterAdapted(plan.dynamics, result.fit.unknowns, &result.parameters);
+  return result;
+}
+
+absl::StatusOr<SystemFit> FitFromScratch(const FitPlan& plan, const nssm::Model& model, const nssm::LossSpec& loss,
+                                         const Trajectory& normalised, const FromScratchOptions& options,
+                                         const std::function<bool(int, double)>& on_step, base::Executor* executor) {
+  METAEKF_ASSIGN_OR_RETURN(const LossData<double> whole, plan.dynamics.Cut(normalised));
+  const Index n = plan.dynamics.unknowns(), channels = plan.dynamics.channels();
+  VectorXd weights = VectorXd::Constant(channels, loss.output_weight);
+  weights.head(channels - model.spec().output_size).setConstant(loss.state_weight);
+  const Belief belief{.mean = VectorXd::Zero(n),
+                      .precision = kFromScratchPrecision * MatrixXd::Identity(n, n),
+                      .noise_variance = weights.cwiseInverse()};
+  const MapFitOptions fit_options{.optimiser = {.max_iterations = options.steps, .tolerance = kFromScratchTolerance}};
+  std::vector<SystemFit> fits(static_cast<size_t>(options.restarts));
+  std::atomic<bool> stopped = false;
+  const auto tell = [&](int step, double cost) {
+    if (on_step && !on_step(step, cost)) stopped = true;
+    return !stopped.load();
+  };
+  const std::function<bool(int, double)> quiet;
+  const auto run = [&](size_t i, const std::function<bool(int, double)>& told) {
+    const uint64_t seed = options.seed + i;
+    const absl::StatusOr<std::vector<double>> linear = LinearStart(model, normalised, seed);
+    fits[i].parameters = linear.ok() ? *linear : model.InitialParameters(seed);
+    VectorXd unknowns = MeanOf(plan.dynamics, fits[i].parameters);
+    const auto fit = [&](const RolloutLeastSquares& problem, const LossData<double>& data) {
+      RolloutLeastSquares::Workspace workspace(problem, data.shape);
+      fits[i].fit = FitMap(problem, data, fits[i].parameters, belief, unknowns, fit_options, &workspace, told);
+      unknowns = fits[i].fit.unknowns;
+    };
+    if (!plan.start) {
+      nssm::LossSpec shorter = loss;
+      for (shorter.horizon = 1; shorter.horizon < whole.shape.horizon && !stopped; shorter.horizon *= kHorizonGrowth) {
+        const RolloutLeastSquares problem(model, shorter, plan.dynamics.mask(), false);
+        const absl::StatusOr<LossData<double>> data = problem.Cut(normalised);
+        if (data.ok()) fit(problem, *data);
+      }
+    }
+    fit(plan.dynamics, whole);
+    ScatterAdapted(plan.dynamics, unknowns, &fits[i].parameters);
+  };
+  if (executor != nullptr) {
+    executor->ParallelFor(fits.size(), [&](size_t i, size_t) { run(i, quiet); });
+  } else {
+    for (size_t i = 0; i < fits.size() && !stopped; ++i) run(i, tell);
+  }
+  const SystemFit* best = nullptr;
+  for (const SystemFit& fit : fits) {
+    const bool usable = fit.fit.unknowns.size() > 0 && std::isfinite(fit.fit.cost);
+    if (usable && (best == nullptr || fit.fit.cost < best->fit.cost)) best = &fit;
+  }
+  if (best == nullptr) {
+    return absl::OutOfRangeError("no start of the fit simulates the system; shorter rollouts or another seed may help");
+  }
+  SystemFit result = *best;
+  const double samples = static_cast<double>(whole.shape.rollouts) * whole.shape.horizon;
+  for (Index c = 0; c < channels; ++c) {
+    if (weights[c] > 0) result.fit.noise_variance[c] = result.fit.channel_squares[c] / samples;
   }
   return result;
 }

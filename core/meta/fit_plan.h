@@ -3,32 +3,29 @@
 #include <optional>
 #include <vector>
 
+#include "core/base/executor.h"
 #include "core/meta/map_fit.h"
 #include "core/nssm/prior.h"
 
 namespace metaekf::meta {
 
-/// What has to be fitted to adapt a model to one system: its dynamics, and where the start is free the encoder
-/// afterwards, on rollouts that start from windows, with the dynamics as they are.
+/// The least-squares problems behind an adaptation.
 struct FitPlan {
   FitPlan(const nssm::Model& model, const nssm::LossSpec& loss, const nn::Mask& adapted);
 
-  nssm::RolloutLeastSquares dynamics;
-  std::optional<nssm::RolloutLeastSquares> encoder;
-  std::optional<nssm::RolloutLeastSquares> start;  ///< of a free start: c₀ alone
+  nssm::RolloutLeastSquares dynamics;              ///< of the adapted parameters, and c₀ where the start is fitted
+  std::optional<nssm::RolloutLeastSquares> start;  ///< there: of c₀ alone
 
   /// Checks that a prior is one of these unknowns. Errors: InvalidArgument naming what does not fit.
   absl::Status CheckPrior(const nssm::GaussianPrior& prior) const;
-  /// The beliefs of a prior about the mean ω.
-  Belief DynamicsBelief(const nssm::GaussianPrior& prior, const std::vector<double>& mean) const;
-  Belief EncoderBelief(const nssm::GaussianPrior& prior, const std::vector<double>& mean) const;
+  /// The belief of a prior about the mean ω.
+  Belief BeliefOf(const nssm::GaussianPrior& prior, const std::vector<double>& mean) const;
 };
 
 /// The most probable parameters of one system.
 struct SystemFit {
   std::vector<double> parameters;  ///< ω
-  MapFit dynamics;
-  std::optional<MapFit> encoder;
+  MapFit fit;
 };
 
 struct SystemFitOptions {
@@ -48,5 +45,22 @@ struct SystemFitOptions {
 absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const nssm::GaussianPrior& prior, const std::vector<double>& mean,
                                     const data::Trajectory& normalised, const SystemFitOptions& options,
                                     const std::function<bool(int, double)>& on_step);
+
+struct FromScratchOptions {
+  uint64_t seed = 0;
+  int32_t restarts = 6;
+  int32_t steps = 60;
+};
+
+/// Fits a system of which nothing is known: the best of several starts, each a linear model of the recording (LinearStart)
+/// where the model has the form for it, else random. Rollouts from measured or encoded starts grow to their full length.
+/// Residuals count as the loss weighs them; the noise variance that comes out is theirs.
+///
+/// @param executor  runs the restarts; nullptr: one after the other.
+/// Errors: as those of FitSystem.
+absl::StatusOr<SystemFit> FitFromScratch(const FitPlan& plan, const nssm::Model& model, const nssm::LossSpec& loss,
+                                         const data::Trajectory& normalised, const FromScratchOptions& options,
+                                         const std::function<bool(int, double)>& on_step,
+                                         base::Executor* executor = nullptr);
 
 }  // namespace metaekf::meta

@@ -83,7 +83,7 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(const Bundle& bundle, con
     // An adaptation that diverges says nothing about noise; the unadapted model stands in.
     parameters[i] = adapted.ok() ? *std::move(adapted) : bundle.parameters;
   });
-  filter::NoiseEstimate noise(bundle.model);
+  filter::NoiseEstimate noise(bundle);
   for (size_t i = 0; i < systems.size(); ++i) {
     METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, systems[i]));
     noise.Add(parameters[i], normalised);
@@ -103,6 +103,9 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
                              base::Executor* executor, const OnTrainingStep& on_step) {
   TrainingSpec spec = given_spec;
   METAEKF_RETURN_IF_ERROR(FitSpecToData(fleet, &spec));
+  if (spec.model.fits_start() && spec.algorithm != Algorithm::kGaussianPrior) {
+    return absl::InvalidArgumentError("algorithm: a model whose start is FITTED is trained by GAUSSIAN_PRIOR");
+  }
   METAEKF_RETURN_IF_ERROR(
       base::Annotate(nssm::ShapeOfLoss(spec.model, spec.loss, spec.context_samples).status(), "context_samples"));
   METAEKF_RETURN_IF_ERROR(

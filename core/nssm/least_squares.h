@@ -77,6 +77,7 @@ class RolloutLeastSquares {
   Eigen::MatrixXd Carries(const double* parameters, const Eigen::VectorXd& start, const LossData<double>& data,
                           Workspace* workspace) const;
 
+  const nn::Mask& mask() const { return mask_; }
   int32_t carry_size() const { return carry_size_; }
   int32_t adapted_size() const { return adapted_size_; }
   int32_t unknowns() const { return adapted_size_ + (free_start_ ? carry_size_ : 0); }

@@ -69,6 +69,7 @@ autodiff::Value BuildLoss(const Model& model, const LossSpec& loss, const LossSh
 }  // namespace
 
 int64_t SamplesNeeded(const ModelSpec& model, const LossSpec& loss) {
+  if (model.fits_start()) return int64_t{model.warmup()} + 1;
   return int64_t{model.warmup()} + std::max<int64_t>(loss.horizon, 1);
 }
 

@@ -26,7 +26,9 @@ Model::Model(const ModelSpec& spec) : spec_(spec) {
   const int32_t latent = spec.latent_size, inputs = spec.input_size;
   const TransitionSpec& transition = spec.transition;
   const bool joint = transition.form == TransitionForm::kJoint && inputs > 0;
-  encoder_ = nn::Block("encoder", spec.encoder, start_size() + (spec.is_case_one() ? 0 : inputs), latent, &layout_);
+  if (!spec.fits_start()) {
+    encoder_ = nn::Block("encoder", spec.encoder, start_size() + (spec.is_case_one() ? 0 : inputs), latent, &layout_);
+  }
   transition_ = nn::Block("transition", transition.block, latent + (joint ? inputs : 0), latent, &layout_);
   if (transition.form == TransitionForm::kAdditive && inputs > 0) {
     transition_input_ = nn::Block("transition_input", transition.input_block, inputs, latent, &layout_);

@@ -100,7 +100,6 @@ absl::Status StoreTensor(const Safetensors::Tensor& tensor, Bundle* bundle, nn::
 template <typename Prior, typename Visit>
 void ForEachPriorMatrix(Prior& prior, const Visit& visit) {
   visit("dynamics", prior.dynamics);
-  visit("encoder", prior.encoder);
   visit("start", prior.start);
   visit("examples", prior.examples);
 }
@@ -220,6 +219,11 @@ absl::StatusOr<Bundle> ReadModelFile(const std::string& bytes) {
     }
     if (!bundle.prior) bundle.prior.emplace();
     METAEKF_RETURN_IF_ERROR(StorePriorTensor(tensor, &*bundle.prior));
+  }
+  if (spec.fits_start()) {
+    const bool whole = bundle.prior && bundle.prior->start.rows() == spec.latent_size && bundle.prior->start.cols() == spec.latent_size &&
+                       bundle.prior->noise_variance.size() == spec.output_size;
+    if (!whole) return absl::InvalidArgumentError("the start of the model is fitted, but the file has no prior to fit it with");
   }
   for (size_t i = 0; i < seen.size(); ++i) {
     if (!seen[i]) {

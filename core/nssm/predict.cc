@@ -6,6 +6,7 @@
 
 #include "core/autodiff/evaluate.h"
 #include "core/base/status.h"
+#include "core/nssm/start_fit.h"
 
 namespace metaekf::nssm {
 namespace {
@@ -22,6 +23,7 @@ using Eigen::MatrixXd;
 enum Slot : int32_t { kParameters, kStart, kInputs, kNextInputs, kOutputsOut, kStatesOut, kCarryOut };
 
 constexpr Index kChunk = 4096;  // columns at a time: enough for wide products, little memory
+constexpr int32_t kFittedWindows = 64;  // side by side
 
 template <typename T>
 using MatrixT = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic>;
@@ -30,10 +32,12 @@ using MatrixT = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic>;
 template <typename T>
 class Predictor {
  public:
-  Predictor(const Model& model, const std::vector<double>& parameters, const data::Trajectory& normalised)
-      : model_(model),
-        spec_(model.spec()),
-        parameters_(parameters.begin(), parameters.end()),
+  Predictor(const Bundle& bundle, const data::Trajectory& normalised)
+      : bundle_(bundle),
+        model_(bundle.model),
+        spec_(model_.spec()),
+        normalised_(normalised),
+        parameters_(bundle.parameters.begin(), bundle.parameters.end()),
         u_(normalised.inputs.cast<T>()),
         y_(normalised.outputs.cast<T>()),
         x_(normalised.states.cast<T>()),
@@ -50,7 +54,11 @@ class Predictor {
       const Index width = std::min(kChunk, length_ - first);  // samples first … first + width − 1 are predicted
       const Compiled& step = OneStepProgram(static_cast<int32_t>(width));
       MatrixT<T> start(model_.start_size(), width);
-      for (Index j = 0; j < width; ++j) start.col(j) = Start(first + j - 1);
+      if (spec_.fits_start()) {
+        start = FitLatents(first - 1, width);
+      } else {
+        for (Index j = 0; j < width; ++j) start.col(j) = Start(first + j - 1);
+      }
       const Index shift = next_inputs() ? 1 : 0;
       const MatrixT<T> inputs = u_.middleCols(first - 1 + shift, width), next = u_.middleCols(first, width);
       MatrixT<T> y(spec_.output_size, width), x(spec_.state_size, width);
@@ -119,7 +127,34 @@ class Predictor {
     return slots;
   }
 
+  /// ψ of samples first … first + count − 1 where the model has no encoder.
+  MatrixT<T> FitLatents(Index first, Index count) const {
+    MatrixT<T> latents(spec_.latent_size, count);
+    const int32_t width = static_cast<int32_t>(std::min<Index>(kFittedWindows, count));
+    StartFit fit(model_, *bundle_.prior, width);
+    Eigen::MatrixXd windows(model_.start_size(), width);
+    for (Index j = 0; j < count; j += width) {
+      const Index some = std::min<Index>(width, count - j);
+      for (Index i = 0; i < some; ++i) {
+        const Index t = first + j + i;
+        windows.col(i) << Stacked(t - warmup_ + 1);
+      }
+      latents.middleCols(j, some) =
+          fit.Fit(bundle_.parameters.data(), windows, static_cast<int32_t>(some)).leftCols(some).template cast<T>();
+    }
+    return latents;
+  }
+
+  /// The window that begins at sample `first`, in double.
+  Eigen::VectorXd Stacked(Index first) const {
+    MatrixXd window(spec_.input_size + spec_.output_size, warmup_);
+    window.topRows(spec_.input_size) = normalised_.inputs.middleCols(first, warmup_);
+    window.bottomRows(spec_.output_size) = normalised_.outputs.middleCols(first, warmup_);
+    return window.reshaped();
+  }
+
   MatrixT<T> EncodeWindow() const {
+    if (spec_.fits_start()) return FitLatents(warmup_ - 1, 1);
     Graph graph;
     const nn::ParameterValues parameters = nn::BindParameters(model_.layout(), kParameters, &graph);
     const Value latent = ModelGraph(&model_, &graph, parameters)
@@ -140,9 +175,9 @@ class Predictor {
     const nn::ParameterValues parameters = nn::BindParameters(model_.layout(), kParameters, &graph);
     const ModelGraph parts(&model_, &graph, parameters);
     const bool has_inputs = spec_.input_size > 0;
-    const Value start = graph.Input(kStart, 0, model_.start_size(), width);
+    const Value start = graph.Input(kStart, 0, spec_.fits_start() ? spec_.latent_size : model_.start_size(), width);
     const Value inputs = has_inputs ? graph.Input(kInputs, 0, spec_.input_size, width) : kNoValue;
-    const Value latent = parts.Advance(parts.Encode(start, inputs), inputs);
+    const Value latent = parts.Advance(spec_.fits_start() ? start : parts.Encode(start, inputs), inputs);
     std::vector<autodiff::Output> outputs;
     if (spec_.is_case_one()) {
       outputs.push_back({parts.Output(latent, kNoValue), kOutputsOut});
@@ -169,8 +204,10 @@ class Predictor {
     return programs_.try_emplace(steps, autodiff::Compile(graph, outputs)).first->second;
   }
 
+  const Bundle& bundle_;
   const Model& model_;
   const ModelSpec& spec_;
+  const data::Trajectory& normalised_;
   const std::vector<T> parameters_;
   const MatrixT<T> u_, y_, x_;
   const Index length_, warmup_;
@@ -180,7 +217,7 @@ class Predictor {
 
 template <typename T>
 Prediction Run(const Bundle& bundle, const data::Trajectory& normalised, PredictionMode mode) {
-  Predictor<T> predictor(bundle.model, bundle.parameters, normalised);
+  Predictor<T> predictor(bundle, normalised);
   return mode == PredictionMode::kOneStep ? predictor.OneStep() : predictor.Simulate();
 }
 

@@ -7,13 +7,11 @@ namespace metaekf::nssm {
 /// What a fleet says of a system of which nothing is known yet: ω ~ N(ω₀, Λ⁻¹) with ω₀ the model's own parameters.
 /// Normalised units; unknowns in the order of ω, adapted tensors only.
 struct GaussianPrior {
-  /// Λ of the adapted parameters; with a free start of those but the encoder's.
-  Eigen::MatrixXd dynamics;
-  /// With a free start: Λ of the encoder's adapted parameters and of c₀ ~ N(0, ·). Else empty.
-  Eigen::MatrixXd encoder, start;
+  Eigen::MatrixXd dynamics;  ///< Λ
+  Eigen::MatrixXd start;     ///< where the start is fitted: of c₀ ~ N(0, start⁻¹); else empty
   /// Variance that remains in every channel (states in Case II, then outputs).
   Eigen::VectorXd noise_variance;
-  /// Fits of systems of the fleet, one a column: where the fit of a new one may start. Unknowns as those of `dynamics`.
+  /// Fits of systems of the fleet, one a column: where the fit of a new one may start. Rows as those of `dynamics`.
   Eigen::MatrixXd examples;
 };
 

@@ -19,6 +19,8 @@ const Names<Activation> kActivations = {
     {"LEAKY_RELU", Activation::kLeakyRelu}, {"ELU", Activation::kElu},  {"SELU", Activation::kSelu},
     {"SWISH", Activation::kSwish}, {"MISH", Activation::kMish},         {"SOFTPLUS", Activation::kSoftplus}};
 const Names<Case> kCases = {{"INPUT_OUTPUT", Case::kInputOutput}, {"STATE_INPUT_OUTPUT", Case::kStateInputOutput}};
+const std::vector<std::pair<std::string, StartMode>> kStarts = {{"ENCODED", StartMode::kEncoded},
+                                                                   {"FITTED", StartMode::kFitted}};
 const Names<Precision> kPrecisions = {{"FLOAT32", Precision::kFloat32}, {"FLOAT64", Precision::kFloat64}};
 const Names<TransitionForm> kForms = {{"JOINT", TransitionForm::kJoint},
                                       {"AUTONOMOUS", TransitionForm::kAutonomous},
@@ -140,6 +142,9 @@ absl::StatusOr<ModelSpec> ReadModelSpec(JsonFields fields) {
   if (!spec.is_case_one() && spec.transition.input_time == InputTime::kNext) {
     fields.Fail("transition.input_time", "NEXT is for Case I; in Case II the transition takes u_t, as the encoder does");
   }
+  spec.start = fields.Choice("start", StartMode::kEncoded, kStarts);
+  if (spec.fits_start() && !spec.is_case_one()) fields.Fail("start", "FITTED is for Case I; in Case II the start is measured");
+  if (spec.fits_start() && fields.Has("encoder")) fields.Fail("encoder", "a model whose start is FITTED has none");
   if (spec.is_curl_free()) CheckCurlFree(&fields, spec);
   METAEKF_RETURN_IF_ERROR(fields.Finish());
   return spec;
@@ -154,8 +159,6 @@ absl::StatusOr<LossSpec> ReadLossSpec(JsonFields fields, const ModelSpec& model)
   spec.output_weight = fields.Number("output_weight", 1, 0, kLargeNumber);
   spec.state_weight = fields.Number("state_weight", model.is_case_one() ? 0 : 1, 0, kLargeNumber);
   spec.reconstruction_weight = fields.Number("reconstruction_weight", model.is_case_one() ? 0 : 1, 0, kLargeNumber);
-  spec.free_start = fields.Bool("free_start", false);
-  if (spec.free_start && !model.is_case_one()) fields.Fail("free_start", "is for Case I; in Case II the start is measured");
   if (model.is_case_one() && spec.rollout == RolloutMode::kState) {
     fields.Fail("rollout", "STATE needs Case II: Case I has no state to encode again");
   }
@@ -174,9 +177,10 @@ json ToJson(const ModelSpec& spec) {
   json result = {{"case", NameOf(kCases, spec.kind)},
                  {"latent_size", spec.latent_size},
                  {"window", spec.window},
-                 {"encoder", BlockJson(spec.encoder)},
                  {"output_decoder", BlockJson(spec.output_decoder)},
-                 {"precision", NameOf(kPrecisions, spec.precision)}};
+                 {"precision", NameOf(kPrecisions, spec.precision)},
+                 {"start", NameOf(kStarts, spec.start)}};
+  if (!spec.fits_start()) result["encoder"] = BlockJson(spec.encoder);
   json transition = {{"block", BlockJson(spec.transition.block)},
                      {"form", NameOf(kForms, spec.transition.form)},
                      {"bypass", NameOf(kBypasses, spec.transition.bypass)},
@@ -200,8 +204,7 @@ json ToJson(const LossSpec& spec) {
                  {"stride", spec.stride},
                  {"output_weight", spec.output_weight},
                  {"state_weight", spec.state_weight},
-                 {"reconstruction_weight", spec.reconstruction_weight},
-                 {"free_start", spec.free_start}};
+                 {"reconstruction_weight", spec.reconstruction_weight}};
   if (spec.horizon == LossSpec::kWholeSet) {
     result["whole_set_horizon"] = true;
   } else {

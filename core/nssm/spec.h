@@ -17,6 +17,7 @@ enum class TransitionForm { kAutonomous, kAdditive, kJoint };
 enum class Bypass { kNone, kSkip, kLinear };
 enum class InputTime { kCurrent, kNext };
 enum class RolloutMode { kLatent, kState };
+enum class StartMode { kEncoded, kFitted };
 
 /// ψ⁺ = bypass + 𝓐(ψ), 𝓐(ψ) + 𝓑(u) or 𝓐([ψ; u]).
 struct TransitionSpec {
@@ -43,8 +44,11 @@ struct ModelSpec {
   nn::BlockSpec output_decoder;
   std::vector<int32_t> curl_free_positions;  ///< not empty: 𝓟y is the gradient with respect to these states
   Precision precision = Precision::kFloat32;
+  StartMode start = StartMode::kEncoded;
 
   bool is_case_one() const { return kind == Case::kInputOutput; }
+  /// Case I without an encoder: latents come from StartFit, fits begin at a free c₀.
+  bool fits_start() const { return start == StartMode::kFitted; }
   bool is_curl_free() const { return !curl_free_positions.empty(); }
   /// Samples needed before the first prediction: H in Case I, 1 in Case II.
   int32_t warmup() const { return is_case_one() ? window : 1; }
@@ -60,7 +64,6 @@ struct LossSpec {
   double output_weight = 1;
   double state_weight = 1;
   double reconstruction_weight = 1;
-  bool free_start = false;  ///< Levenberg–Marquardt in Case I: c₀ is an unknown, the encoder fitted afterwards
 };
 
 /// Read the JSON forms of the messages. Errors: InvalidArgument naming the field and what is wrong with it.

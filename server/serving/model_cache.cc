@@ -112,15 +112,18 @@ ModelCache::Loaded ModelCache::GetOrLoad(const std::string& key, const Load& loa
 ModelCache::Loaded ModelCache::Serve(nssm::Bundle bundle, const std::string& version,
                                      const std::string& adaptation) {
   auto model = std::make_shared<ServedModel>(ServedModel{.bundle = std::move(bundle)});
-  model->filter_model = FilterModelOf(model->bundle.model);
+  model->filter_model = FilterModelOf(model->bundle, version);
   model->filter_parameters = model->filter_model->Prepare(model->bundle.parameters);
   model->model_version = version;
   model->adaptation = adaptation;
   return model;
 }
 
-std::shared_ptr<const filter::FilterModel> ModelCache::FilterModelOf(const nssm::Model& model) {
-  const std::string architecture = nssm::ToJson(model.spec()).dump();
+std::shared_ptr<const filter::FilterModel> ModelCache::FilterModelOf(const nssm::Bundle& bundle,
+                                                                    const std::string& version) {
+  // A fitted start takes the version's prior into the filter model.
+  const nssm::ModelSpec& spec = bundle.model.spec();
+  const std::string architecture = absl::StrCat(spec.fits_start() ? version : "", nssm::ToJson(spec).dump());
   const auto find = [&]() -> std::shared_ptr<const filter::FilterModel> {
     const auto found = filter_models_.find(architecture);
     return found == filter_models_.end() ? nullptr : found->second.lock();
@@ -129,7 +132,7 @@ std::shared_ptr<const filter::FilterModel> ModelCache::FilterModelOf(const nssm:
     std::lock_guard lock(mutex_);
     if (auto found = find()) return found;
   }
-  std::shared_ptr<const filter::FilterModel> made = filter::FilterModel::Create(model);
+  std::shared_ptr<const filter::FilterModel> made = filter::FilterModel::Create(bundle);
   std::lock_guard lock(mutex_);
   if (auto found = find()) return found;
   filter_models_[architecture] = made;

@@ -55,7 +55,8 @@ class ModelCache {
   template <class Load>
   Loaded GetOrLoad(const std::string& key, const Load& load);
   Loaded Serve(nssm::Bundle bundle, const std::string& version, const std::string& adaptation);
-  std::shared_ptr<const filter::FilterModel> FilterModelOf(const nssm::Model& model);
+  std::shared_ptr<const filter::FilterModel> FilterModelOf(const nssm::Bundle& bundle,
+                                                          const std::string& version);
   void Keep(const Model& model);  // with mutex_ held
 
   store::Store& store_;

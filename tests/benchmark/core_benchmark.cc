@@ -51,7 +51,7 @@ nssm::ModelSpec LocalisationSpec() {
 double EkfStepSeconds() {
   nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(LocalisationSpec()));
   bundle.parameters = bundle.model.InitialParameters(1);
-  const std::shared_ptr<filter::FilterModel> model = filter::FilterModel::Create(bundle.model);
+  const std::shared_ptr<filter::FilterModel> model = filter::FilterModel::Create(bundle);
   filter::Ekf ekf = *filter::Ekf::Create(bundle, model, model->Prepare(bundle.parameters), {});
   const auto scratch = model->MakeScratch();
   filter::Estimate estimate = ekf.MakeEstimate();

@@ -26,7 +26,7 @@ TEST(FilterModelTest, JacobiansMatchCentralDifferencesForEveryKindOfModel) {
   for (const nssm::ModelCase& c : nssm::ModelCases()) {
     SCOPED_TRACE(c.name);
     const nssm::Model model = *nssm::Model::Create(c.model);
-    const auto filter_model = FilterModel::Create(model);
+    const auto filter_model = FilterModel::Create(nssm::Bundle{.model = model});
     const auto parameters = filter_model->Prepare(nssm::RandomParameters(model, 5));
     const auto scratch = filter_model->MakeScratch();
     const Eigen::Index n = filter_model->state_size(), n_y = c.model.output_size;
@@ -83,7 +83,7 @@ nssm::Bundle LinearBundle(const LinearSystem& system) {
 
 struct Filter {
   explicit Filter(const nssm::Bundle& bundle, const FilterOptions& options = {})
-      : model(FilterModel::Create(bundle.model)),
+      : model(FilterModel::Create(bundle)),
         scratch(model->MakeScratch()),
         ekf(*Ekf::Create(bundle, model, model->Prepare(bundle.parameters), options)),
         estimate(ekf.MakeEstimate()) {}
@@ -216,7 +216,7 @@ TEST(EkfTest, ARestoredFilterGoesOnBitForBit) {
 
 TEST(EkfTest, WrongNoiseIsRefusedByName) {
   const nssm::Bundle bundle = LinearBundle(LinearSystem());
-  const std::shared_ptr<FilterModel> model = FilterModel::Create(bundle.model);
+  const std::shared_ptr<FilterModel> model = FilterModel::Create(bundle);
   const std::shared_ptr<FilterModel::Parameters> parameters = model->Prepare(bundle.parameters);
   const auto message = [&](const FilterOptions& options) {
     return std::string(Ekf::Create(bundle, model, parameters, options).status().message());

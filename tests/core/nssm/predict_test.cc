@@ -40,7 +40,7 @@ TEST(PredictTest, BothModesEqualTheStepFunctions) {
     SCOPED_TRACE(c.name);
     const Bundle bundle = SomeBundle(c);
     const data::Trajectory t = RandomTrajectory(c.model, 15, 2);
-    const auto fm = filter::FilterModel::Create(bundle.model);
+    const auto fm = filter::FilterModel::Create(bundle);
     const auto parameters = fm->Prepare(bundle.parameters);
     const auto scratch = fm->MakeScratch();
     const Index n = fm->state_size(), n_y = c.model.output_size, warmup = c.model.warmup();
@@ -94,7 +94,7 @@ TEST(PredictTest, ACurlFreeFieldIsCurlFreeInPhysicalUnits) {
     bundle.normaliser.states.mean = VectorXd::LinSpaced(2, 1, 2);
     const auto field = [&](double p0, double p1) {
       // ŷ_1 = h(x̂_1, u_1) would need f; h alone is a one-step prediction's output at a fixed x̂: use the filter's h.
-      const auto fm = filter::FilterModel::Create(bundle.model);
+      const auto fm = filter::FilterModel::Create(bundle);
       VectorXd h(2), x{{(p0 - 1) / 5, (p1 - 2) / 5}};
       MatrixXd H(2, 2);
       fm->Measurement(*fm->Prepare(bundle.parameters), x, VectorXd::Constant(1, 0.4), &h, &H, fm->MakeScratch().get());

@@ -68,9 +68,9 @@ v1::TrainingSpec FullSpec() {
   model.set_output_size(2);  // as many as positions
   // The others are for adaptation.
   spec.mutable_inner_loop()->set_optimiser(v1::InnerLoopSpec::GRADIENT_DESCENT);
+  model.set_start(v1::ModelSpec::ENCODED);  // FITTED is Case I's
   // Read as the whole set, which has no number.
   spec.mutable_loss()->clear_horizon();
-  spec.mutable_loss()->set_free_start(false);  // of Case I
   return spec;
 }
 

@@ -127,7 +127,7 @@ class EstimationServiceTest : public ServerTest {
 
   /// What the filter says that is called directly.
   Estimates Direct(const Recording& recording) const {
-    const std::shared_ptr<filter::FilterModel> model = filter::FilterModel::Create(bundle_->model);
+    const std::shared_ptr<filter::FilterModel> model = filter::FilterModel::Create(*bundle_);
     filter::Ekf ekf = *filter::Ekf::Create(*bundle_, model, model->Prepare(bundle_->parameters), {});
     const auto scratch = model->MakeScratch();
     filter::Estimate estimate = ekf.MakeEstimate();
