@@ -24,6 +24,8 @@ using nssm::RolloutLeastSquares;
 constexpr double kTolerance = 1e-5;
 constexpr double kStalled = 6;            // times the median mean square of the residuals
 constexpr size_t kBatch = 8;              // systems between two calls of on_step
+constexpr Index kGuessStride = 5;         // samples between windows of the regression for the start
+constexpr double kGuessRidge = 1e-8;
 
 MatrixXd Inverse(const MatrixXd& positive_definite) {
   return positive_definite.llt().solve(MatrixXd::Identity(positive_definite.rows(), positive_definite.cols()));
@@ -87,6 +89,7 @@ class Learner {
       METAEKF_RETURN_IF_ERROR(Validate());
       Save(round_ + 1);
     }
+    if (plan_.start) LearnStartGuess();
     return std::move(best_);
   }
 
@@ -272,6 +275,34 @@ class Learner {
     const Index count = predictions.cols() - from;
     const double loss = (predictions.bottomRows(n_y) - measured).rightCols(count).squaredNorm() / static_cast<double>(count * n_y);
     return std::isfinite(loss) ? std::min(loss, kHopeless) : kHopeless;
+  }
+
+  // ---- where StartFit begins ----
+
+  /// Linear regression of the fits' latents on the windows that begin with them.
+  void LearnStartGuess() {
+    const nssm::ModelSpec& model = spec_.model;
+    const Index window = model.window, rows = model.input_size + model.output_size, size = window * rows + 1;
+    MatrixXd gram = MatrixXd::Zero(size, size), products = MatrixXd::Zero(size, model.latent_size);
+    VectorXd regressor = VectorXd::Ones(size);
+    for (size_t s = 0; s < data_.size(); ++s) {
+      if (!population_.accepted[s]) continue;
+      const Trajectory& system = systems_.training[s];
+      std::vector<double> parameters = best_.parameters;
+      ScatterAdapted(plan_.dynamics, population_.fits[s], &parameters);
+      const MatrixXd latents = plan_.dynamics.Carries(parameters.data(), population_.fits[s].tail(model.latent_size), data_[s],
+                                                      workspaces_[0].For(plan_.dynamics, data_[s].shape));
+      for (Index t = 0; t + window <= system.length(); t += kGuessStride) {
+        for (Index k = 0; k < window; ++k) {
+          regressor.segment(k * rows, model.input_size) = system.inputs.col(t + k);
+          regressor.segment(k * rows + model.input_size, model.output_size) = system.outputs.col(t + k);
+        }
+        gram.selfadjointView<Eigen::Lower>().rankUpdate(regressor);
+        products += regressor * latents.col(t).transpose();
+      }
+    }
+    gram.diagonal().array() += kGuessRidge * gram.diagonal().mean();
+    best_.prior.start_guess = gram.selfadjointView<Eigen::Lower>().llt().solve(products).transpose();
   }
 
   // ---- checkpoints ----

@@ -101,6 +101,7 @@ template <typename Prior, typename Visit>
 void ForEachPriorMatrix(Prior& prior, const Visit& visit) {
   visit("dynamics", prior.dynamics);
   visit("start", prior.start);
+  visit("start_guess", prior.start_guess);
   visit("examples", prior.examples);
 }
 
@@ -138,7 +139,8 @@ absl::Status StorePriorTensor(const Safetensors::Tensor& tensor, GaussianPrior* 
       return;
     }
     matrix = Eigen::Map<const Eigen::MatrixXd>(tensor.values.data(), tensor.shape[1], tensor.shape[0]).transpose();
-    if (name != "examples" && !matrix.isApprox(matrix.transpose(), 1e-9)) status = invalid("is not symmetric");
+    const bool symmetric = name == "dynamics" || name == "start";
+    if (symmetric && !matrix.isApprox(matrix.transpose(), 1e-9)) status = invalid("is not symmetric");
   });
   return known ? status : invalid("is not part of a prior");
 }
@@ -222,7 +224,9 @@ absl::StatusOr<Bundle> ReadModelFile(const std::string& bytes) {
   }
   if (spec.fits_start()) {
     const bool whole = bundle.prior && bundle.prior->start.rows() == spec.latent_size && bundle.prior->start.cols() == spec.latent_size &&
-                       bundle.prior->noise_variance.size() == spec.output_size;
+                       bundle.prior->noise_variance.size() == spec.output_size &&
+                       bundle.prior->start_guess.rows() == spec.latent_size &&
+                       bundle.prior->start_guess.cols() == bundle.model.start_size() + 1;
     if (!whole) return absl::InvalidArgumentError("the start of the model is fitted, but the file has no prior to fit it with");
   }
   for (size_t i = 0; i < seen.size(); ++i) {

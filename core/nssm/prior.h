@@ -9,6 +9,8 @@ namespace metaekf::nssm {
 struct GaussianPrior {
   Eigen::MatrixXd dynamics;  ///< Λ
   Eigen::MatrixXd start;     ///< where the start is fitted: of c₀ ~ N(0, start⁻¹); else empty
+  /// Where the start is fitted: ψ_s ≈ G [window; 1] at the window's first sample, from where StartFit begins.
+  Eigen::MatrixXd start_guess;
   /// Variance that remains in every channel (states in Case II, then outputs).
   Eigen::VectorXd noise_variance;
   /// Fits of systems of the fleet, one a column: where the fit of a new one may start. Rows as those of `dynamics`.

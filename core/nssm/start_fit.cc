@@ -20,7 +20,7 @@ namespace {
 
 enum Slot : int32_t { kParameters, kCarry, kInput, kNextOut, kOutputOut, kByCarryNextOut, kByCarryOutputOut };
 
-constexpr int kPasses = 10;
+constexpr int kPasses = 30;
 constexpr double kFirstDamping = 1e-3, kDampingFactor = 10;
 constexpr double kConverged = 1e-9;  // relative decrease of the cost that a column stops at
 
@@ -34,6 +34,7 @@ StartFit::StartFit(const Model& model, const GaussianPrior& prior, int32_t width
       width_(width),
       input_shift_(model.spec().transition.input_time == InputTime::kNext ? 1 : 0),
       start_precision_(prior.start),
+      guess_(prior.start_guess),
       weights_(prior.noise_variance.cwiseInverse()) {
   const int32_t n = latent_size_;
   Graph graph;
@@ -121,7 +122,11 @@ void StartFit::Evaluate(const double* parameters, const MatrixXd& windows, int32
 }
 
 const MatrixXd& StartFit::Fit(const double* parameters, const MatrixXd& windows, int32_t count) {
-  for (int32_t j = 0; j < count; ++j) trial_[static_cast<size_t>(j)].start.setZero();
+  for (int32_t j = 0; j < count; ++j) {
+    VectorXd& start = trial_[static_cast<size_t>(j)].start;
+    start = guess_.col(windows.rows());
+    start.noalias() += guess_.leftCols(windows.rows()).lazyProduct(windows.col(j));
+  }
   Evaluate(parameters, windows, count);
   for (int32_t j = 0; j < count; ++j) {
     std::swap(best_[static_cast<size_t>(j)], trial_[static_cast<size_t>(j)]);

@@ -14,11 +14,11 @@ namespace metaekf::nssm {
 ///
 ///   ψ_s = argmin ½ Σ_{k=s+1…t} |y_k − ŷ_k(ψ_s)|²/σ² + ½ ψ_sᵀ Λ ψ_s,   s = t − H + 1
 ///
-/// by Levenberg–Marquardt from ψ_s = 0 with exact Jacobians, several windows side by side. In double, normalised units.
+/// by Levenberg–Marquardt from the prior's guess with exact Jacobians, several windows side by side. In double, normalised units.
 /// One thread at a time; Fit does not allocate.
 class StartFit {
  public:
-  /// @param prior  its `start` is Λ, its `noise_variance` σ². @param width  windows side by side.
+  /// @param prior  its `start` is Λ, its `noise_variance` σ², its `start_guess` where the fit begins. @param width  windows side by side.
   StartFit(const Model& model, const GaussianPrior& prior, int32_t width);
 
   /// @param windows  start_size() × width, samples oldest first, each [u; y]. Columns beyond `count` are not read.
@@ -39,7 +39,7 @@ class StartFit {
 
   int32_t latent_size_, input_size_, output_size_, window_, width_;
   int32_t input_shift_;  // of the step's input behind the sample it starts from
-  Eigen::MatrixXd start_precision_;
+  Eigen::MatrixXd start_precision_, guess_;
   Eigen::VectorXd weights_;
   std::optional<autodiff::Executable<double>> step_;
   std::optional<autodiff::Arena<double>> arena_;

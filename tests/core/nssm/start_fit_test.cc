@@ -1,0 +1,117 @@
+#include "core/nssm/start_fit.h"
+
+#include <gtest/gtest.h>
+
+#include <Eigen/Cholesky>
+#include <Eigen/LU>
+
+#include "core/nssm/linearise.h"
+#include "tests/core/nssm/random_models.h"
+
+namespace metaekf::nssm {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+constexpr Index kWindow = 12;
+
+ModelSpec FittedSpec(InputTime input_time) {
+  ModelSpec spec = ModelCases().front().model;
+  spec.start = StartMode::kFitted;
+  spec.window = kWindow;
+  spec.transition.form = TransitionForm::kJoint;
+  spec.transition.bypass = Bypass::kLinear;
+  spec.transition.input_time = input_time;
+  spec.output_decoder.hidden_widths.clear();
+  return spec;
+}
+
+GaussianPrior Prior(const Model& model, double precision) {
+  const Index n = model.spec().latent_size;
+  return {.start = precision * MatrixXd::Identity(n, n),
+          .start_guess = MatrixXd::Zero(n, model.start_size() + 1),
+          .noise_variance = VectorXd::LinSpaced(model.spec().output_size, 0.5, 2)};
+}
+
+/// A window that the model itself has made from ψ_s, and where it ends.
+struct Made {
+  Made(const Model& model, const std::vector<double>& parameters, uint64_t seed, double noise) {
+    base::Rng rng(seed);
+    const ModelSpec& spec = model.spec();
+    const Index n_u = spec.input_size, n_y = spec.output_size, shift = spec.transition.input_time == InputTime::kNext ? 1 : 0;
+    window = MatrixXd::Zero(n_u + n_y, kWindow);
+    for (Index i = 0; i < n_u * kWindow; ++i) window(i % n_u, i / n_u) = rng.Normal();
+    end = VectorXd::Zero(spec.latent_size);
+    for (double& value : end) value = rng.Normal();
+    start = end;
+    for (Index k = 0; k + 1 < kWindow; ++k) {
+      const VectorXd u = window.col(k + shift).head(n_u);
+      end = Linearise(model, parameters, end, u).f;
+      window.col(k + 1).tail(n_y) = Linearise(model, parameters, end, u).h;
+      for (Index i = 0; i < n_y; ++i) window(n_u + i, k + 1) += noise * rng.Normal();
+    }
+  }
+  MatrixXd window;
+  VectorXd start, end;
+};
+
+TEST(StartFitTest, FindsTheEndOfATrajectoryThatTheModelMade) {
+  for (const InputTime input_time : {InputTime::kCurrent, InputTime::kNext}) {
+    const Model model = *Model::Create(FittedSpec(input_time));
+    const std::vector<double> parameters = RandomParameters(model, 5);
+    for (uint64_t seed = 0; seed < 10; ++seed) {
+      const Made made(model, parameters, seed, 0);
+      GaussianPrior prior = Prior(model, 1e-12);
+      prior.start_guess.rightCols(1) = made.start + VectorXd::Constant(made.start.size(), 0.2);
+      StartFit fit(model, prior, 1);
+      EXPECT_LT((fit.Fit(parameters.data(), made.window.reshaped(), 1).col(0) - made.end).norm(), 1e-6 * made.end.norm());
+    }
+  }
+}
+
+TEST(StartFitTest, ALinearModelsStartIsBayesianLinearRegressions) {
+  ModelSpec spec = FittedSpec(InputTime::kNext);
+  spec.transition.block.hidden_widths.clear();  // f is linear
+  const Model model = *Model::Create(spec);
+  const std::vector<double> parameters = RandomParameters(model, 6);
+  const GaussianPrior prior = Prior(model, 0.7);
+  const Made made(model, parameters, 3, 0.5);
+  // y_k = C ψ_k + d with ψ_k = A^k ψ_s + …: the regression by its definition.
+  const Index n = spec.latent_size, n_y = spec.output_size, n_u = spec.input_size;
+  MatrixXd information = prior.start, power = MatrixXd::Identity(n, n);
+  VectorXd right = VectorXd::Zero(n), offset = VectorXd::Zero(n);
+  const VectorXd weights = prior.noise_variance.cwiseInverse();
+  for (Index k = 1; k < kWindow; ++k) {
+    const Linearisation l = Linearise(model, parameters, offset, made.window.col(k).head(n_u));
+    power = l.A * power;
+    offset = l.f;
+    const Linearisation out = Linearise(model, parameters, offset, made.window.col(k).head(n_u));
+    const MatrixXd rows = out.C * power;
+    information += rows.transpose() * weights.asDiagonal() * rows;
+    right += rows.transpose() * weights.cwiseProduct(made.window.col(k).tail(n_y) - out.h);
+  }
+  const VectorXd start = information.llt().solve(right);
+  StartFit fit(model, prior, 1);
+  EXPECT_LT((fit.Fit(parameters.data(), made.window.reshaped(), 1).col(0) - (power * start + offset)).norm(), 1e-6);
+  EXPECT_LT((fit.Covariance(0) - power * information.inverse() * power.transpose()).norm(), 1e-9);
+}
+
+TEST(StartFitTest, WindowsSideBySideDoNotTouchEachOther) {
+  const Model model = *Model::Create(FittedSpec(InputTime::kNext));
+  const std::vector<double> parameters = RandomParameters(model, 5);
+  StartFit one(model, Prior(model, 0.1), 1), many(model, Prior(model, 0.1), 5);
+  MatrixXd windows(model.start_size(), 5);
+  for (uint64_t seed = 0; seed < 5; ++seed) {
+    windows.col(static_cast<Index>(seed)) = Made(model, parameters, seed, 0.3).window.reshaped();
+  }
+  const MatrixXd together = many.Fit(parameters.data(), windows, 4).leftCols(4);
+  for (Index j = 0; j < 4; ++j) {
+    // All go on until the last is done: to more digits, not to another place.
+    EXPECT_LT((together.col(j) - one.Fit(parameters.data(), windows.col(j), 1).col(0)).norm(), 1e-4);
+  }
+}
+
+}  // namespace
+}  // namespace metaekf::nssm
