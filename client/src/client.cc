@@ -37,9 +37,13 @@ Status Client::Impl::Translate(const grpc::Status& status) const {
   if (result.code == Code::kUnavailable && status.error_details().empty()) {
     // Errors of gRPC itself, not of the server.
     const bool unresolved = result.message.find("resolution failed") != std::string::npos;
-    const bool never_connected = channel->GetState(false) == GRPC_CHANNEL_TRANSIENT_FAILURE ||
-                                 result.message.find("failed to connect") != std::string::npos;
-    if (unresolved || never_connected) {
+    const bool refused = result.message.find("Connection refused") != std::string::npos;
+    const bool never_connected = result.message.find("failed to connect") != std::string::npos;
+    if (never_connected && !refused && !unresolved) {
+      // A server may well be there: say what gRPC says.
+      result.reason = "NO_CONNECTION";
+      result.message = "cannot connect to " + options.server + " (" + result.message + ")";
+    } else if (unresolved || refused) {
       result.reason = "NO_SERVER";
       result.message = "no server at " + options.server +
                        (unresolved ? ", an address that cannot be resolved" : "");

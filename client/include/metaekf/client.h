@@ -322,8 +322,8 @@ class EstimationSession;
 /// sessions by their ids. Any name may also be given as the server spells it
 /// ("models/m/versions/3").
 ///
-/// Errors of every call: Unavailable with reason NO_SERVER if none answers at the address and
-/// CONNECTION_LOST if it went away; DeadlineExceeded; InvalidArgument with the wrong fields;
+/// Errors of every call: Unavailable with reason NO_SERVER if nothing listens at the address,
+/// NO_CONNECTION if something may but no connection came about, CONNECTION_LOST if it went away; DeadlineExceeded; InvalidArgument with the wrong fields;
 /// NotFound; what the server says otherwise.
 class Client {
  public:
