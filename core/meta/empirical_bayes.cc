@@ -22,6 +22,7 @@ using nssm::LossData;
 using nssm::RolloutLeastSquares;
 
 constexpr double kTolerance = 1e-5;
+constexpr double kWarmDamping = 1e-2;     // of a fit that goes on from the last round's
 constexpr double kStalled = 6;            // times the median mean square of the residuals
 constexpr size_t kBatch = 8;              // systems between two calls of on_step
 constexpr Index kGuessStride = 5;         // samples between windows of the regression for the start
@@ -147,19 +148,20 @@ class Learner {
     std::vector<MatrixXd> covariances(count);
     std::vector<double> mean_squares(count);
     std::vector<VectorXd> variances(count);
-    const LearnedPrior current = Current();
+    LearnedPrior current = Current();
     for (size_t first = 0; first < count; first += kBatch) {
       const size_t batch = std::min(kBatch, count - first);
+      if (round_ == 0) current.prior.examples = Examples(first);
       executor_.ParallelFor(batch, [&](size_t i, size_t slot) {
         const size_t s = first + i;
-        MapFit fit = FitMap(plan_.dynamics, data_[s], current.parameters, belief, population_.fits[s],
-                            {.optimiser = {.max_iterations = steps, .tolerance = kTolerance}},
+        // With other fits among its starts a system can join the basin that most are in, where the prior is narrower.
+        absl::StatusOr<SystemFit> found =
+            FitSystem(plan_, current.prior, current.parameters, systems_.training[s],
+                      {.steps = steps, .tolerance = kTolerance, .noise_samples = std::numeric_limits<double>::infinity()}, nullptr);
+        MapFit own = FitMap(plan_.dynamics, data_[s], current.parameters, belief, population_.fits[s],
+                            {.optimiser = {.max_iterations = steps, .tolerance = kTolerance, .initial_damping = kWarmDamping}},
                             workspaces_[slot].For(plan_.dynamics, data_[s].shape));
-        if (!population_.accepted[s]) {
-          absl::StatusOr<SystemFit> other = FitSystem(plan_, current.prior, current.parameters, systems_.training[s],
-                                                      {.steps = steps, .tolerance = kTolerance}, nullptr);
-          if (other.ok() && other->fit.cost < fit.cost) fit = std::move(other->fit);
-        }
+        const MapFit& fit = found.ok() && !(own.cost <= found->fit.cost) ? found->fit : own;
         population_.fits[s] = fit.unknowns;
         covariances[s] = Inverse(fit.information);
         const double samples = static_cast<double>(Samples(data_[s]));
@@ -222,15 +224,19 @@ class Learner {
     prior.dynamics = population_.belief.precision.topLeftCorner(p, p);
     prior.start = population_.belief.precision.bottomRightCorner(n, n);
     prior.noise_variance = population_.belief.noise_variance;
-    std::vector<Index> accepted;
-    for (size_t s = 0; s < population_.fits.size(); ++s) {
-      if (population_.accepted[s]) accepted.push_back(static_cast<Index>(s));
-    }
-    prior.examples.resize(p, static_cast<Index>(accepted.size()));
-    for (Index i = 0; i < prior.examples.cols(); ++i) {
-      prior.examples.col(i) = population_.fits[static_cast<size_t>(accepted[static_cast<size_t>(i)])].head(p);
-    }
+    prior.examples = Examples(population_.fits.size());
     return current;
+  }
+
+  /// The accepted fits among the first `count` systems.
+  MatrixXd Examples(size_t count) const {
+    const Index p = plan_.dynamics.adapted_size();
+    MatrixXd examples(p, static_cast<Index>(std::count(population_.accepted.begin(), population_.accepted.begin() + static_cast<Index>(count), true)));
+    Index column = 0;
+    for (size_t s = 0; s < count; ++s) {
+      if (population_.accepted[s]) examples.col(column++) = population_.fits[s].head(p);
+    }
+    return examples;
   }
 
   // ---- validation ----

@@ -25,10 +25,10 @@ constexpr int kScreeningSteps = 4;         // for c₀ of each
 constexpr size_t kContenders = 3;          // starts that go on
 constexpr int kContenderSteps = 10;
 constexpr double kContenderTolerance = 1e-3;
+constexpr double kWarmDamping = 1e-2;      // of the fit that goes on from a contender's
 constexpr double kFromScratchPrecision = 1e-6;  // knows nothing
 constexpr double kFromScratchTolerance = 1e-5;
 constexpr int kHorizonGrowth = 4;          // from one stage to the next
-constexpr double kNoiseSamples = 200;      // that the fleet's noise variance counts for beside the system's own
 
 VectorXd MeanOf(const RolloutLeastSquares& problem, const std::vector<double>& mean) {
   VectorXd unknowns = VectorXd::Zero(problem.unknowns());
@@ -48,10 +48,7 @@ struct Candidate {
   VectorXd unknowns;
 };
 
-void SortByCost(std::vector<Candidate>* candidates) {
-  std::stable_sort(candidates->begin(), candidates->end(),
-                   [](const Candidate& a, const Candidate& b) { return a.cost < b.cost; });
-}
+bool Cheaper(const Candidate& a, const Candidate& b) { return a.cost < b.cost; }
 
 }  // namespace
 
@@ -92,6 +89,7 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
   RolloutLeastSquares::Workspace workspace(plan.dynamics, data.shape);
 
   std::vector<Candidate> candidates;
+  bool mean_simulates = false;
   {
     METAEKF_ASSIGN_OR_RETURN(const Trajectory head,
                              data::FirstSamples(normalised, std::min(normalised.length(), kScreeningSamples)));
@@ -114,13 +112,16 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
         candidate.cost = screened.Cost(parameters.data(), VectorXd(), weights, few, &screening);
       }
       candidate.cost += Penalty(belief, candidate.unknowns, adapted);
-      if (std::isfinite(candidate.cost)) candidates.push_back(std::move(candidate));
+      if (!std::isfinite(candidate.cost)) continue;
+      mean_simulates = mean_simulates || i < 0;
+      candidates.push_back(std::move(candidate));
     }
   }
   if (candidates.empty()) {
     return absl::OutOfRangeError("the fit diverged: neither the meta-learned parameters nor any example simulate this system");
   }
-  SortByCost(&candidates);
+  // The mean stays among them: it is rarely near, but the fit from there is the least likely to stall.
+  std::stable_sort(candidates.begin() + (mean_simulates ? 1 : 0), candidates.end(), Cheaper);
   if (candidates.size() > kContenders) candidates.resize(kContenders);
 
   SystemFit result{.parameters = mean};
@@ -138,11 +139,13 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
       candidate = {fit.cost, fit.unknowns};
       if (stopped) break;
     }
-    SortByCost(&candidates);
+    std::stable_sort(candidates.begin(), candidates.end(), Cheaper);
   }
   result.fit = FitMap(plan.dynamics, data, mean, belief, candidates[0].unknowns,
-                           {.optimiser = {.max_iterations = stopped ? 0 : options.steps, .tolerance = options.tolerance},
-                            .noise_samples = kNoiseSamples},
+                           {.optimiser = {.max_iterations = stopped ? 0 : options.steps,
+                                          .tolerance = options.tolerance,
+                                          .initial_damping = kWarmDamping},
+                            .noise_samples = options.noise_samples},
                            &workspace, tell);
   ScatterAdapted(plan.dynamics, result.fit.unknowns, &result.parameters);
   return result;

@@ -31,12 +31,14 @@ struct SystemFit {
 struct SystemFitOptions {
   int32_t steps = 60;     ///< Levenberg–Marquardt steps at most, of each fit
   double tolerance = 1e-4;
+  /// How many samples' worth of evidence the prior's noise variance counts for; infinite: it is not estimated.
+  double noise_samples = 200;
 };
 
 /// Fits a system under a prior.
 ///
-/// The start is the best of the mean and the prior's examples: every one's own start c₀ is fitted to the first samples,
-/// the most probable few go on for some steps, the best of them to the end.
+/// It starts from the mean and from those of the prior's examples under which the first samples are most probable, each with
+/// a start c₀ fitted to them. All go on for some steps, the best of them to the end.
 ///
 /// @param mean        ω₀.
 /// @param normalised  the context, in normalised units.

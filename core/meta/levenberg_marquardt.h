@@ -21,7 +21,7 @@ struct Objective {
 struct LevenbergMarquardtOptions {
   int max_iterations = 50;
   double tolerance = 1e-6;       ///< ends when a step promises or brings less than this share of Φ
-  double initial_damping = 1e-3; ///< of the curvature's diagonal
+  double initial_damping = 1;    ///< of the curvature's diagonal; less leaps out of the basin that the start is in
 };
 
 struct LevenbergMarquardtResult {

@@ -18,9 +18,13 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-constexpr Index kLongestOrder = 40;
+constexpr Index kLongestOrder = 20;
+// Of the mean square of a regressor. Without it an input that leaves frequencies out lets the ARX model invent modes there.
+constexpr double kArxRidge = 1e-4;
 constexpr Index kResponse = 400;   // samples of the impulse response
 constexpr double kLargestPole = 0.999;
+constexpr double kLatentStd = 0.3;     // small: the hidden units begin where they are nearly linear
+constexpr double kSlowOutput = 0.3;    // standard deviation of what the output sees of a slow mode
 
 /// h_0 … h_{count−1}, n_y × n_u each, of the ARX model of the given order.
 std::vector<MatrixXd> ImpulseResponse(const data::Trajectory& recording, Index order, Index count) {
@@ -33,7 +37,7 @@ std::vector<MatrixXd> ImpulseResponse(const data::Trajectory& recording, Index o
     for (Index i = 0; i <= order; ++i) phi.block(order * n_y + i * n_u, t, n_u, 1) = u.col(t + order - i);
   }
   MatrixXd gram = phi * phi.transpose();
-  gram.diagonal().array() += 1e-9 * gram.diagonal().mean();
+  gram.diagonal().array() += kArxRidge * gram.diagonal().mean();
   const MatrixXd theta = gram.ldlt().solve(phi * y.rightCols(rows).transpose()).transpose();
   std::vector<MatrixXd> response;
   for (Index k = 0; k < count; ++k) {
@@ -92,7 +96,7 @@ absl::StatusOr<std::vector<double>> LinearStart(const nssm::Model& model, const 
   MatrixXd output = observability.topRows(n_y), input = controllability.leftCols(n_u);
   const double radius = transition.eigenvalues().cwiseAbs().maxCoeff();
   if (radius > kLargestPole) transition *= kLargestPole / radius;
-  // Slow modes, leaky integrators of the input that the output does not see yet: what the network will bend into memory.
+  // Slow modes, leaky integrators of the input: what the network will bend into memory.
   base::Rng rng(seed, 1);
   const Index all = spec.latent_size;
   transition.conservativeResizeLike(MatrixXd::Zero(all, all));
@@ -101,18 +105,20 @@ absl::StatusOr<std::vector<double>> LinearStart(const nssm::Model& model, const 
   for (Index i = 0; i < slow; ++i) {
     transition(n + i, n + i) = 1 - 0.1 * std::pow(0.3, static_cast<double>(i));
     for (Index j = 0; j < n_u; ++j) input(n + i, j) = rng.Normal();
-    for (Index j = 0; j < n_y; ++j) output(j, n + i) = 0.1 * rng.Normal();
   }
-  // Unit standard deviation of every latent on the recording.
+  // The same standard deviation of every latent on the recording.
   VectorXd latent = VectorXd::Zero(all), squares = VectorXd::Zero(all);
   for (Index t = 0; t < normalised.length(); ++t) {
     latent = transition * latent + input * normalised.inputs.col(t);
     squares += latent.cwiseAbs2();
   }
-  const VectorXd scale = (squares / static_cast<double>(normalised.length())).cwiseSqrt().cwiseMax(1e-9);
+  const VectorXd scale = (squares / static_cast<double>(normalised.length())).cwiseSqrt().cwiseMax(1e-9) / kLatentStd;
   transition = scale.cwiseInverse().asDiagonal() * transition * scale.asDiagonal();
   input = scale.cwiseInverse().asDiagonal() * input;
   output = output * scale.asDiagonal();
+  for (Index i = n; i < all; ++i) {
+    for (Index j = 0; j < n_y; ++j) output(j, i) = kSlowOutput * rng.Normal();
+  }
 
   std::vector<double> parameters = model.InitialParameters(seed);
   const nn::ParameterLayout& layout = model.layout();

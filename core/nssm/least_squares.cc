@@ -8,6 +8,7 @@
 
 #include "core/autodiff/differentiate.h"
 #include "core/autodiff/per_column.h"
+#include "core/nssm/sensitivity.h"
 
 namespace metaekf::nssm {
 namespace {
@@ -37,27 +38,29 @@ enum Slot : int32_t {
 
 // Columns at a time: enough for wide products, few enough that their Jacobians stay in the cache.
 constexpr int32_t kColumns = 64;
+constexpr int64_t kPanel = 256;  // rows of J that are squared at a time
 
 /// Component `row` of a value with `rows` rows: the cotangent that picks it in every column.
 Value Pick(Graph* graph, int32_t row, int32_t rows, int32_t columns) {
   return graph->PadRows(graph->Constant(1, 1, columns), row, rows);
 }
 
-/// Appends to `outputs` the Jacobian of every component of `value` with respect to the parameters `wrt`, one
-/// p × columns block after the other, from `offset` on.
-void AddParameterJacobian(Graph* graph, Value value, const std::vector<Value>& wrt, int32_t size, int64_t offset,
+/// Appends to `outputs` the Jacobian of every component of `value` with respect to the parameters `wrt`: of each component
+/// one tensor after the other, size × columns each, from `offset` on.
+void AddParameterJacobian(Graph* graph, Value value, const std::vector<Value>& wrt, int64_t offset,
                           std::vector<Output>* outputs) {
   const int32_t rows = wrt.empty() ? 0 : graph->node(value).rows, columns = graph->node(value).cols;
-  for (int32_t row = 0; row < rows; ++row, offset += int64_t{size} * columns) {
+  for (int32_t row = 0; row < rows; ++row) {
     const std::vector<Value> cotangents =
         autodiff::Vjp(graph, {{value, Pick(graph, row, rows, columns)}}, wrt);
-    std::vector<Value> parts;
     for (size_t i = 0; i < wrt.size(); ++i) {
       const autodiff::Node& shape = graph->node(wrt[i]);
-      parts.push_back(cotangents[i] == kNoValue ? graph->Constant(0, shape.rows * shape.cols, columns)
-                                                : autodiff::PerColumn(graph, cotangents[i], columns));
+      const int32_t size = shape.rows * shape.cols;
+      const Value part = cotangents[i] == kNoValue ? graph->Constant(0, size, columns)
+                                                   : autodiff::PerColumn(graph, cotangents[i], columns);
+      outputs->push_back({part, kByParametersOut, offset});
+      offset += int64_t{size} * columns;
     }
-    outputs->push_back({graph->ConcatRows(parts), kByParametersOut, offset});
   }
 }
 
@@ -137,7 +140,7 @@ RolloutLeastSquares::Workspace::Workspace(const RolloutLeastSquares& owner, cons
     const Value latent =
         parts.Encode(graph.Input(kStart, 0, model.start_size(), width_), input(&graph, kFirstInput, width_));
     std::vector<Output> outputs{{latent, kNextOut}};
-    AddParameterJacobian(&graph, latent, wrt, p, 0, &outputs);
+    AddParameterJacobian(&graph, latent, wrt, 0, &outputs);
     encode_.emplace(autodiff::Compile(graph, outputs));
   }
   {
@@ -162,7 +165,7 @@ RolloutLeastSquares::Workspace::Workspace(const RolloutLeastSquares& owner, cons
     const auto add = [&](Value value) {
       const int64_t rows = graph.node(value).rows;
       AddCarryJacobian(&graph, value, carry, by_carry, &outputs);
-      AddParameterJacobian(&graph, value, wrt, p, by_parameters, &outputs);
+      AddParameterJacobian(&graph, value, wrt, by_parameters, &outputs);
       by_carry += rows * n * columns;
       by_parameters += rows * p * columns;
     };
@@ -175,8 +178,10 @@ RolloutLeastSquares::Workspace::Workspace(const RolloutLeastSquares& owner, cons
   }
   sensitivity_.setZero(unknowns, n * width_);
   next_sensitivity_.setZero(unknowns, n);
-  rows_.setZero(unknowns, owner.channels_ * columns);
-  residuals_.setZero(owner.channels_ * columns);
+  direct_.setZero(unknowns);
+  factors_.setZero(n);
+  rows_.setZero(unknowns, std::max<int64_t>(kPanel, owner.channels_));
+  residuals_.setZero(rows_.cols());
 }
 
 void RolloutLeastSquares::Encode(const double* parameters, const LossData<double>& data, int32_t first, int32_t count,
@@ -276,16 +281,32 @@ void RolloutLeastSquares::Linearise(const double* parameters, const VectorXd& st
       .Input(kInputs, w.inputs_.data())
       .Output(kByCarryOut, w.by_carry_.data())
       .Output(kByParametersOut, w.by_parameters_.data());
-  // Row i of [F; C] at a column, as a stride over blocks: each value's Jacobian is rows × (n · columns).
+  // Each value's Jacobian by the carry is rows × (n · columns).
   const double* by_carry_next = w.by_carry_.data();
   const double* by_carry_channels = by_carry_next + int64_t{n} * n * columns;
-  const double* by_parameters = w.by_parameters_.data();
-  const auto local_jacobian = [&](int32_t row, int32_t carry, int64_t column) {
-    if (row < n) return by_carry_next[(carry * columns + column) * n + row];
-    const int32_t channel = row - n, outputs = q - state_channels_;
+  const auto by_carry = [&](int32_t component, int32_t carry, int64_t column) {
+    if (component < n) return by_carry_next[(carry * columns + column) * n + component];
+    const int32_t channel = component - n, outputs = q - state_channels_;
     if (channel < state_channels_) return by_carry_channels[(carry * columns + column) * state_channels_ + channel];
     return by_carry_channels[int64_t{state_channels_} * n * columns + (carry * columns + column) * outputs + channel -
                              state_channels_];
+  };
+  // Of a component at one of `width` columns, into direct_.
+  const auto gather_by_parameters = [&](int32_t component, int64_t column, int64_t width) {
+    const double* part = w.by_parameters_.data() + int64_t{component} * p * width;
+    double* to = w.direct_.data();
+    for (const auto& [offset, size] : adapted_) {
+      std::copy_n(part + column * size, size, to);
+      part += size * width;
+      to += size;
+    }
+  };
+  int64_t rows = 0;
+  const auto square = [&] {
+    cblas_dsyrk(CblasColMajor, CblasLower, CblasNoTrans, all, static_cast<int>(rows), 1, w.rows_.data(), all, 1,
+                result->curvature.data(), all);
+    result->gradient.noalias() += w.rows_.leftCols(rows) * w.residuals_.head(rows);
+    rows = 0;
   };
   ForEachPiece(parameters, start, data, workspace, [&](int32_t step, int32_t steps, int32_t first, int32_t count) {
     if (step == 0) {
@@ -294,41 +315,39 @@ void RolloutLeastSquares::Linearise(const double* parameters, const VectorXd& st
       if (!free_start_ && mode_ == RolloutMode::kLatent) {  // Encode has just written ∂𝓔/∂ω
         for (int32_t i = 0; i < n; ++i) {
           for (int32_t j = 0; j < count; ++j) {
-            w.sensitivity_.col(j * n + i) = Eigen::Map<const VectorXd>(by_parameters + (int64_t{i} * w.width_ + j) * p, p);
+            gather_by_parameters(i, j, w.width_);
+            w.sensitivity_.col(j * n + i) = w.direct_;
           }
         }
       }
     }
     autodiff::Evaluate(w.local_->executable, slots, w.local_->arena);
-    int64_t row = 0;
     for (int32_t k = 0; k < steps; ++k) {
       for (int32_t j = 0; j < count; ++j) {
         const int64_t local = int64_t{k} * w.width_ + j, column = int64_t{step + k} * data.shape.rollouts + first + j;
         auto sensitivity = w.sensitivity_.middleCols(j * n, n);
-        const auto derivative = [&](int32_t component, double scale, auto&& target) {
-          target.head(p) = scale * Eigen::Map<const VectorXd>(by_parameters + (int64_t{component} * columns + local) * p, p);
-          target.tail(all - p).setZero();
-          for (int32_t i = 0; i < n; ++i) {
-            const double factor = scale * local_jacobian(component, i, local);
-            if (factor != 0) target += factor * sensitivity.col(i);
-          }
+        const auto derivative = [&](int32_t component, double scale, double* target) {
+          gather_by_parameters(component, local, columns);
+          if (scale != 1) w.direct_ *= scale;
+          for (int32_t i = 0; i < n; ++i) w.factors_[i] = scale * by_carry(component, i, local);
+          PropagateSensitivity(static_cast<size_t>(all), static_cast<size_t>(n), sensitivity.data(), w.factors_.data(),
+                               w.direct_.data(), target);
         };
         for (int32_t c = 0; c < q; ++c) {
           if (weights[c] == 0) continue;
           const double r = Residual(data, c, column, w.channels_(c, local));
           result->channel_squares[c] += r * r;
-          derivative(n + c, root[c], w.rows_.col(row));
-          w.residuals_[row++] = root[c] * r;
+          derivative(n + c, root[c], w.rows_.col(rows).data());
+          w.residuals_[rows++] = root[c] * r;
+          if (rows == w.rows_.cols()) square();
         }
-        for (int32_t i = 0; i < n; ++i) derivative(i, 1, w.next_sensitivity_.col(i));
+        for (int32_t i = 0; i < n; ++i) derivative(i, 1, w.next_sensitivity_.col(i).data());
         sensitivity = w.next_sensitivity_;
       }
     }
-    cblas_dsyrk(CblasColMajor, CblasLower, CblasNoTrans, all, static_cast<int>(row), 1, w.rows_.data(), all, 1,
-                result->curvature.data(), all);
-    result->gradient.noalias() += w.rows_.leftCols(row) * w.residuals_.head(row);
     return true;
   });
+  square();
   result->cost = 0.5 * weights.dot(result->channel_squares);
 }
 

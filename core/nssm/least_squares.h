@@ -58,8 +58,9 @@ class RolloutLeastSquares {
     Eigen::MatrixXd carry_, carries_, next_, channels_;  // what the rollout writes
     Eigen::MatrixXd values_;         // 𝓔, or [f; g], unused
     Eigen::MatrixXd by_carry_;       // [F; C]: of every carry component one block of columns
-    Eigen::MatrixXd by_parameters_;  // ∂[f; g]/∂ω: of every component one block of columns
+    Eigen::MatrixXd by_parameters_;  // ∂[f; g]/∂ω: of every component, tensor by tensor, columns
     Eigen::MatrixXd sensitivity_, next_sensitivity_;  // S of every rollout side by side, unknowns × n each
+    Eigen::VectorXd direct_, factors_;                // of one component: by θ, zero beyond ω, and by the carry
     Eigen::MatrixXd rows_;                            // weighted rows of J, as columns
     Eigen::VectorXd residuals_;                       // weighted
   };
