@@ -124,6 +124,20 @@ std::vector<double> JsonFields::Numbers(const std::string& name) {
   return result;
 }
 
+std::map<std::string, double> JsonFields::NumbersByName(const std::string& name, double low, double high) {
+  std::map<std::string, double> result;
+  const nlohmann::json* value = Find(name);
+  if (value == nullptr) return result;
+  if (!value->is_object()) {
+    Fail(name, absl::StrCat("expected an object, got ", Shown(*value)));
+    return result;
+  }
+  for (const auto& item : value->items()) {
+    result[item.key()] = ReadNumber(item.value(), absl::StrCat(name, ".", item.key()), low, high, false);
+  }
+  return result;
+}
+
 int64_t JsonFields::ChoiceIndex(const std::string& name, const std::vector<std::string>& names) {
   const nlohmann::json* value = Find(name);
   if (value == nullptr) return -1;

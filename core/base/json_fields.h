@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <map>
 #include <nlohmann/json.hpp>
 #include <set>
 #include <string>
@@ -27,6 +28,8 @@ class JsonFields {
   std::string String(const std::string& name, const std::string& default_value);
   std::vector<int32_t> Integers(const std::string& name, int32_t low, int32_t high);
   std::vector<double> Numbers(const std::string& name);
+  /// An object whose names are the user's own.
+  std::map<std::string, double> NumbersByName(const std::string& name, double low, double high);
   template <typename Enum>
   Enum Choice(const std::string& name, Enum default_value, const std::vector<std::pair<std::string, Enum>>& choices) {
     std::vector<std::string> names;

@@ -8,6 +8,7 @@
 #include "core/meta/adam.h"
 #include "core/meta/arx.h"
 #include "core/meta/fit_plan.h"
+#include "core/meta/inner_loop.h"
 #include "core/nssm/loss.h"
 
 namespace metaekf::meta {
@@ -54,10 +55,47 @@ absl::Status Diverged(int32_t step, double loss, double learning_rate) {
                                             "; a smaller learning rate may help"));
 }
 
-/// Runs the adaptation on one piece of context in normalised units.
+/// The steps of InnerLoop, in double whatever the model's precision.
+class GradientSteps {
+ public:
+  GradientSteps(const AdaptationOptions& options, const nn::ParameterLayout& layout, double pull,
+                const std::vector<double>& start)
+      : adam_(options.method != AdaptationMethod::kGradientDescent),
+        layout_(layout),
+        rates_(RatesOfTensors(options.inner_loop, layout)),
+        pull_(pull),
+        start_(start),
+        m_(start.size()),
+        v_(start.size()) {}
+
+  /// @param gradient  zero in what does not adapt. @param step  counts from 1.
+  template <typename T>
+  void Step(int32_t step, const std::vector<T>& gradient, std::vector<double>* parameters) {
+    const AdamCorrections corrections(step);
+    for (size_t l = 0; l < rates_.size(); ++l) {
+      const nn::Tensor& tensor = layout_.tensors()[l];
+      for (size_t i = static_cast<size_t>(tensor.offset); i < static_cast<size_t>(tensor.offset + tensor.size()); ++i) {
+        double& value = (*parameters)[i];
+        const double g = static_cast<double>(gradient[i]) + (adam_ ? pull_ * (value - start_[i]) : 0);
+        value -= rates_[l] * (adam_ ? AdamDirection(g, corrections, &m_[i], &v_[i]) : g);
+        if (!adam_ && pull_ > 0) value = start_[i] + (value - start_[i]) / (1 + rates_[l] * pull_);
+      }
+    }
+  }
+
+ private:
+  const bool adam_;
+  const nn::ParameterLayout& layout_;
+  const std::vector<double> rates_;  // of every tensor
+  const double pull_;                // λ
+  const std::vector<double> start_;
+  std::vector<double> m_, v_;
+};
+
+/// Runs the adaptation on one piece of context in normalised units. @param pull  λ of ½ λ |ω − ω₀|² beside the loss.
 template <typename T>
-absl::StatusOr<FitResult> Fit(const Bundle& bundle, nssm::LossSpec loss, const Trajectory& context, const nn::Mask& mask,
-                              const AdaptationOptions& options, const OnStep& on_step) {
+absl::StatusOr<FitResult> Fit(const Bundle& bundle, nssm::LossSpec loss, double pull, const Trajectory& context,
+                              const nn::Mask& mask, const AdaptationOptions& options, const OnStep& on_step) {
   const nssm::ModelSpec& spec = bundle.model.spec();
   METAEKF_ASSIGN_OR_RETURN(LossShape shape, nssm::ShapeOfLoss(spec, loss, context.length()));
   const int64_t columns = int64_t{shape.rollouts} * shape.horizon;
@@ -73,22 +111,16 @@ absl::StatusOr<FitResult> Fit(const Bundle& bundle, nssm::LossSpec loss, const T
                                                                        : bundle.parameters;
   nssm::RoundToPrecision(spec.precision, &result.parameters);
   std::vector<T> typed(result.parameters.begin(), result.parameters.end()), typed_gradient(typed.size());
-  std::vector<double> gradient(typed.size()), m(typed.size(), 0), v(typed.size(), 0);
+  GradientSteps stepper(options, bundle.model.layout(), pull, result.parameters);
   const int32_t steps = options.inner_loop.steps;
-  const double learning_rate = options.inner_loop.learning_rate;
   for (int32_t step = 0; step <= steps; ++step) {
     const double value = step < steps ? function.Gradient(typed.data(), data, typed_gradient.data(), scratch)
                                       : function.Value(typed.data(), data, scratch);
-    if (!std::isfinite(value)) return Diverged(step, value, learning_rate);
+    if (!std::isfinite(value)) return Diverged(step, value, options.inner_loop.learning_rate);
     (step == 0 ? result.loss_before : result.loss_after) = value;
     if (step > 0 && on_step && !on_step({.step = step, .steps = steps, .loss = value})) return absl::CancelledError("the adaptation was cancelled");
     if (step == steps) break;
-    gradient.assign(typed_gradient.begin(), typed_gradient.end());
-    if (options.method == AdaptationMethod::kGradientDescent) {
-      for (size_t i = 0; i < gradient.size(); ++i) result.parameters[i] -= learning_rate * gradient[i];
-    } else {
-      AdamStep(gradient, step + 1, learning_rate, &m, &v, &result.parameters);
-    }
+    stepper.Step(step + 1, typed_gradient, &result.parameters);
     nssm::RoundToPrecision(spec.precision, &result.parameters);
     typed.assign(result.parameters.begin(), result.parameters.end());
   }
@@ -141,16 +173,23 @@ absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const ns
   return result;
 }
 
-absl::StatusOr<FitResult> FitAnyPrecision(const Bundle& bundle, const nssm::LossSpec& loss, const Trajectory& context,
-                                          const nn::Mask& mask, const AdaptationOptions& options,
-                                          const OnStep& on_step) {
+/// What is to be minimised over what.
+struct Problem {
+  nssm::LossSpec loss;
+  double pull = 0;  // λ of what IMPLICIT_MAML minimises in training too
+  nn::Mask mask;
+  Trajectory context;  // found fit for adaptation
+};
+
+absl::StatusOr<FitResult> FitAnyPrecision(const Bundle& bundle, const Problem& problem, const Trajectory& context,
+                                          const AdaptationOptions& options, const OnStep& on_step) {
   METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, context));
   if (options.method == AdaptationMethod::kLevenbergMarquardt || bundle.model.spec().fits_start()) {
-    return FitByLevenbergMarquardt(bundle, loss, normalised, mask, options, on_step);
+    return FitByLevenbergMarquardt(bundle, problem.loss, normalised, problem.mask, options, on_step);
   }
   return bundle.model.spec().precision == nssm::Precision::kFloat32
-             ? Fit<float>(bundle, loss, normalised, mask, options, on_step)
-             : Fit<double>(bundle, loss, normalised, mask, options, on_step);
+             ? Fit<float>(bundle, problem.loss, problem.pull, normalised, problem.mask, options, on_step)
+             : Fit<double>(bundle, problem.loss, problem.pull, normalised, problem.mask, options, on_step);
 }
 
 absl::StatusOr<TailErrors> ErrorsOf(const Bundle& bundle, const Trajectory& tail) {
@@ -177,13 +216,6 @@ TailErrors ArxErrors(const Trajectory& head, const Trajectory& tail, int64_t war
   return errors;
 }
 
-/// A context found fit for adaptation, with what is to be minimised over what.
-struct Problem {
-  nssm::LossSpec loss;
-  nn::Mask mask;
-  Trajectory context;
-};
-
 absl::StatusOr<Problem> Pose(const Bundle& bundle, const Trajectory& context, const AdaptationOptions& options) {
   const nssm::ModelSpec& spec = bundle.model.spec();
   METAEKF_ASSIGN_OR_RETURN(const TrainingSpec training, ReadTrainingSpec(bundle.training));
@@ -201,6 +233,10 @@ absl::StatusOr<Problem> Pose(const Bundle& bundle, const Trajectory& context, co
   }
   Problem problem{.loss = training.loss, .context = context};
   METAEKF_ASSIGN_OR_RETURN(problem.mask, nn::ParseMask(options.inner_loop.adapted_mask, bundle.model.layout()));
+  METAEKF_RETURN_IF_ERROR(CheckTensorRates(options.inner_loop, bundle.model.layout()));
+  if (training.algorithm == Algorithm::kImplicitMaml && options.method != AdaptationMethod::kFromScratch) {
+    problem.pull = options.inner_loop.proximal;
+  }
   if (spec.is_case_one()) problem.context.states.resize(0, context.length());
   return problem;
 }
@@ -215,6 +251,14 @@ AdaptationMethod MethodOf(Optimiser optimiser) {
       return AdaptationMethod::kLevenbergMarquardt;
   }
   return AdaptationMethod::kGradientDescent;
+}
+
+/// Rates for a method that the model is not meant for: those of training if it used the method, else `otherwise`.
+void TakeRates(const InnerLoopSpec& training, AdaptationMethod method, double otherwise, InnerLoopSpec* inner_loop) {
+  const bool trained_with = MethodOf(training.optimiser) == method;
+  inner_loop->learning_rate = trained_with ? training.learning_rate : otherwise;
+  inner_loop->tensor_rates.clear();
+  if (trained_with) inner_loop->tensor_rates = training.tensor_rates;
 }
 
 /// Samples of the context's end that are held out.
@@ -244,13 +288,14 @@ absl::StatusOr<AdaptationOptions> DefaultAdaptation(const Bundle& bundle, std::o
   if (options.method == AdaptationMethod::kFromScratch) {
     if (!bundle.model.spec().fits_start()) options.inner_loop.steps *= kScratchSteps;
     options.inner_loop.learning_rate = kScratchLearningRate;
+    options.inner_loop.tensor_rates.clear();
     options.inner_loop.adapted_mask = "*";
   } else if (options.method == AdaptationMethod::kAdam && trained_for != AdaptationMethod::kAdam) {
-    options.inner_loop.learning_rate = kAdamLearningRate;
+    TakeRates(training->inner_loop, options.method, kAdamLearningRate, &options.inner_loop);
   } else if (options.method == AdaptationMethod::kLevenbergMarquardt && trained_for != options.method) {
     options.inner_loop.steps = kLevenbergMarquardtSteps;
   } else if (options.method == AdaptationMethod::kGradientDescent && trained_for != options.method) {
-    options.inner_loop.learning_rate = training->inner_loop.learning_rate;
+    TakeRates(training->inner_loop, options.method, InnerLoopSpec().learning_rate, &options.inner_loop);
   }
   return options;
 }
@@ -263,7 +308,7 @@ absl::StatusOr<std::vector<double>> AdaptedParameters(const Bundle& bundle, cons
                                                       const AdaptationOptions& options) {
   METAEKF_ASSIGN_OR_RETURN(const Problem problem, Pose(bundle, context, options));
   METAEKF_ASSIGN_OR_RETURN(FitResult fit,
-                           FitAnyPrecision(bundle, problem.loss, problem.context, problem.mask, options, nullptr));
+                           FitAnyPrecision(bundle, problem, problem.context, options, nullptr));
   return std::move(fit.parameters);
 }
 
@@ -286,13 +331,13 @@ absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& c
     return !on_step || on_step(step);
   };
   METAEKF_ASSIGN_OR_RETURN(FitResult trial,
-                           FitAnyPrecision(bundle, problem.loss, head, problem.mask, options, on_trial_step));
+                           FitAnyPrecision(bundle, problem, head, options, on_trial_step));
   adapted.parameters = std::move(trial.parameters);
   METAEKF_ASSIGN_OR_RETURN(result.after, ErrorsOf(adapted, tail));
   result.arx = ArxErrors(head, tail, spec.warmup());
 
   METAEKF_ASSIGN_OR_RETURN(FitResult fit,
-                           FitAnyPrecision(bundle, problem.loss, problem.context, problem.mask, options, on_step));
+                           FitAnyPrecision(bundle, problem, problem.context, options, on_step));
   result.parameters = std::move(fit.parameters);
   result.information = std::move(fit.information);
   result.context_loss_before = fit.loss_before;

@@ -1,89 +1,147 @@
 #include "core/meta/meta_gradient.h"
 
 #include <algorithm>
+#include <cmath>
 
 namespace metaekf::meta {
 
 using nssm::LossData;
-using nssm::LossFunction;
+using nssm::LossShape;
 
 namespace {
 
 nn::Mask AllOf(const nssm::Model& model) { return nn::Mask(model.layout().tensors().size(), true); }
 
+InnerRecord RecordFor(const TrainingSpec& spec) {
+  if (spec.algorithm == Algorithm::kMaml) return InnerRecord::kSteps;
+  const bool needs_total = spec.algorithm == Algorithm::kReptile || spec.inner_loop.learned_rates;
+  return needs_total ? InnerRecord::kTotal : InnerRecord::kResult;
+}
+
+template <typename T>
+InnerLoop<T> MakeLoop(const nssm::Model& model, const TrainingSpec& spec, const nn::Mask& adapted) {
+  const int32_t steps = spec.algorithm == Algorithm::kSupervised ? 0 : spec.inner_loop.steps;
+  const double pull = spec.algorithm == Algorithm::kImplicitMaml ? spec.inner_loop.proximal : 0;
+  return InnerLoop<T>(model.layout(), adapted, spec.inner_loop.optimiser, steps, pull, RecordFor(spec));
+}
+
+std::vector<double> RatesOfAdapted(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& adapted) {
+  const std::vector<double> of_tensors = RatesOfTensors(spec.inner_loop, model.layout());
+  std::vector<double> rates;
+  for (size_t i = 0; i < adapted.size(); ++i) {
+    if (adapted[i]) rates.push_back(of_tensors[i]);
+  }
+  return rates;
+}
+
 }  // namespace
 
 template <typename T>
-void RunInnerLoop(const LossFunction<T>& context_loss, const LossData<T>& context, int32_t steps, double learning_rate,
-                  int64_t size, T* iterates, T* gradient, const typename LossFunction<T>::Scratch& scratch) {
-  for (int32_t m = 0; m < steps; ++m) {
-    const T* current = iterates + m * size;
-    T* next = iterates + (m + 1) * size;
-    context_loss.Gradient(current, context, gradient, scratch);
-    for (int64_t i = 0; i < size; ++i) next[i] = current[i] - static_cast<T>(learning_rate) * gradient[i];
-  }
-}
-
-template <typename T>
-MetaGradient<T>::MetaGradient(const nssm::Model& model, const nssm::LossSpec& loss, Algorithm algorithm,
-                              const nssm::LossShape& context, const nssm::LossShape& target, const nn::Mask& adapted,
-                              int32_t steps, double learning_rate)
-    : algorithm_(algorithm),
-      steps_(steps),
-      learning_rate_(learning_rate),
+MetaGradient<T>::MetaGradient(const nssm::Model& model, const TrainingSpec& spec, const LossShape& context,
+                              const LossShape& target, const nn::Mask& adapted)
+    : algorithm_(spec.algorithm),
+      learned_rates_(spec.inner_loop.learned_rates),
       size_(model.layout().size()),
-      inner_(model, loss, context, adapted, adapted),
-      outer_(model, loss, context, AllOf(model), adapted),
-      target_(model, loss, target, AllOf(model), adapted) {
-  for (size_t i = 0; i < adapted.size(); ++i) {
-    const nn::Tensor& tensor = model.layout().tensors()[i];
-    if (!adapted[i]) frozen_.push_back({tensor.offset, tensor.size()});
-  }
-}
+      rates_(RatesOfAdapted(spec, model, adapted)),
+      loop_(MakeLoop<T>(model, spec, adapted)),
+      implicit_(model.layout(), adapted, spec.inner_loop.proximal, spec.implicit_maml),
+      inner_(model, spec.loss, context, adapted, adapted),
+      outer_(model, spec.loss, context, AllOf(model), adapted),
+      target_(model, spec.loss, target, AllOf(model), adapted) {}
 
 template <typename T>
 MetaGradient<T>::Scratch::Scratch(const MetaGradient& owner)
-    : iterates_(static_cast<size_t>((owner.InnerSteps() + 1) * owner.size_)),
-      product_(static_cast<size_t>(owner.size_)),
-      masked_(static_cast<size_t>(owner.size_)),
+    : trace_(owner.loop_, owner.learned_rates_),
+      implicit_(owner.implicit_, owner.algorithm_ == Algorithm::kImplicitMaml),
+      target_gradient_(owner.algorithm_ == Algorithm::kReptile ? static_cast<size_t>(owner.size_) : 0),
+      rates_(owner.rates_),
+      rate_adjoints_(owner.rates_.size()),
       inner_(owner.inner_.MakeScratch()),
       outer_(owner.outer_.MakeScratch()),
       target_(owner.target_.MakeScratch()) {}
 
 template <typename T>
-const T* MetaGradient<T>::Adapt(const T* parameters, const LossData<T>& context, Scratch* scratch) const {
-  std::copy_n(parameters, size_, scratch->iterates_.data());
-  RunInnerLoop(inner_, context, InnerSteps(), learning_rate_, size_, scratch->iterates_.data(),
-               scratch->product_.data(), scratch->inner_);
-  return scratch->iterates_.data() + InnerSteps() * size_;
+size_t MetaGradient<T>::variables() const {
+  return static_cast<size_t>(size_) + (learned_rates_ ? rates_.size() : 0);
 }
 
 template <typename T>
-double MetaGradient<T>::TargetLoss(const T* parameters, const LossData<T>& context, const LossData<T>& target,
+void MetaGradient<T>::ReadRates(const T* variables, Scratch* scratch) const {
+  if (!learned_rates_) return;
+  for (size_t l = 0; l < rates_.size(); ++l) scratch->rates_[l] = std::exp(static_cast<double>(variables[static_cast<size_t>(size_) + l]));
+}
+
+template <typename T>
+const T* MetaGradient<T>::Adapt(const T* variables, const LossData<T>& context, Scratch* scratch) const {
+  ReadRates(variables, scratch);
+  const auto gradient = [&](const T* at, T* result) { inner_.Gradient(at, context, result, scratch->inner_); };
+  return loop_.Run(variables, scratch->rates_, gradient, &scratch->trace_);
+}
+
+template <typename T>
+double MetaGradient<T>::TargetLoss(const T* variables, const LossData<T>& context, const LossData<T>& target,
                                    Scratch* scratch) const {
-  return target_.Value(Adapt(parameters, context, scratch), target, scratch->target_);
+  return target_.Value(Adapt(variables, context, scratch), target, scratch->target_);
 }
 
 template <typename T>
-double MetaGradient<T>::Compute(const T* parameters, const LossData<T>& context, const LossData<T>& target, T* gradient,
+double MetaGradient<T>::Compute(const T* variables, const LossData<T>& context, const LossData<T>& target, T* gradient,
                                 Scratch* scratch) const {
-  const T* adapted = Adapt(parameters, context, scratch);
+  if (algorithm_ == Algorithm::kReptile) return Reptile(variables, context, target, gradient, scratch);
+  const T* adapted = Adapt(variables, context, scratch);
   const double loss = target_.Gradient(adapted, target, gradient, scratch->target_);
-  if (algorithm_ != Algorithm::kMaml) return loss;
-  for (int32_t m = steps_; m >= 1; --m) {
-    std::copy_n(gradient, size_, scratch->masked_.data());
-    for (const auto& [offset, size] : frozen_) std::fill_n(scratch->masked_.data() + offset, size, T(0));
-    outer_.HessianVector(scratch->iterates_.data() + (m - 1) * size_, context, scratch->masked_.data(),
-                         scratch->product_.data(), scratch->outer_);
-    for (int64_t i = 0; i < size_; ++i) gradient[i] -= static_cast<T>(learning_rate_) * scratch->product_[static_cast<size_t>(i)];
+  std::fill(scratch->rate_adjoints_.begin(), scratch->rate_adjoints_.end(), 0.0);
+  if (algorithm_ == Algorithm::kMaml) PullBack(context, gradient, scratch);
+  if (algorithm_ == Algorithm::kImplicitMaml) {
+    const auto hessian_vector = [&](const T* v, T* product) {
+      outer_.HessianVector(adapted, context, v, product, scratch->outer_);
+    };
+    implicit_.Apply(hessian_vector, gradient, &scratch->implicit_);
   }
+  if (learned_rates_) WriteRateGradient(gradient, scratch);
   return loss;
 }
 
-template void RunInnerLoop(const LossFunction<float>&, const LossData<float>&, int32_t, double, int64_t, float*, float*,
-                           const LossFunction<float>::Scratch&);
-template void RunInnerLoop(const LossFunction<double>&, const LossData<double>&, int32_t, double, int64_t, double*,
-                           double*, const LossFunction<double>::Scratch&);
+template <typename T>
+void MetaGradient<T>::PullBack(const LossData<T>& context, T* gradient, Scratch* scratch) const {
+  const auto hessian_vector = [&](const T* at, const T* v, T* product) {
+    outer_.HessianVector(at, context, v, product, scratch->outer_);
+  };
+  loop_.PullBack(scratch->rates_, hessian_vector, &scratch->trace_, gradient,
+                 learned_rates_ ? scratch->rate_adjoints_.data() : nullptr);
+}
+
+template <typename T>
+void MetaGradient<T>::WriteRateGradient(T* gradient, Scratch* scratch) const {
+  for (size_t l = 0; l < rates_.size(); ++l) {
+    double adjoint = scratch->rate_adjoints_[l];
+    if (algorithm_ == Algorithm::kFirstOrderMaml) {
+      const auto [offset, size] = loop_.adapted()[l];
+      for (int64_t i = offset; i < offset + size; ++i) {
+        adjoint -= static_cast<double>(gradient[i]) * static_cast<double>(scratch->trace_.total()[i]);
+      }
+    }
+    gradient[static_cast<size_t>(size_) + l] = static_cast<T>(scratch->rates_[l] * adjoint);
+  }
+}
+
+template <typename T>
+double MetaGradient<T>::Reptile(const T* variables, const LossData<T>& context, const LossData<T>& target, T* gradient,
+                                Scratch* scratch) const {
+  const auto samples = [](const LossShape& shape) { return static_cast<double>(shape.rollouts) * shape.horizon; };
+  const double share = samples(context.shape) / (samples(context.shape) + samples(target.shape));
+  T* of_target = scratch->target_gradient_.data();
+  const auto union_gradient = [&](const T* at, T* result) {
+    outer_.Gradient(at, context, result, scratch->outer_);
+    target_.Gradient(at, target, of_target, scratch->target_);
+    for (int64_t i = 0; i < size_; ++i) result[i] = static_cast<T>(share * result[i] + (1 - share) * of_target[i]);
+  };
+  const T* adapted = loop_.Run(variables, scratch->rates_, union_gradient, &scratch->trace_);
+  std::copy_n(scratch->trace_.total(), size_, gradient);
+  return share * outer_.Value(adapted, context, scratch->outer_) +
+         (1 - share) * target_.Value(adapted, target, scratch->target_);
+}
+
 template class MetaGradient<float>;
 template class MetaGradient<double>;
 

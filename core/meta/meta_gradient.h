@@ -2,67 +2,80 @@
 
 #include <vector>
 
+#include "core/meta/implicit_gradient.h"
+#include "core/meta/inner_loop.h"
 #include "core/meta/training_spec.h"
 #include "core/nssm/loss.h"
 
 namespace metaekf::meta {
 
-/// ω_m = ω_{m−1} − β ∇L(𝓒; ω_{m−1}) for the adapted parameters; the others stay (eqs. maml_inner, anil_inner).
+/// The gradient of one task after the inner loop, with respect to the parameters before it.
 ///
-/// @param iterates  (m + 1) · n_ω elements, ω_0 in the first n_ω; the rest is written.
-/// @param gradient  n_ω elements of scratch.
-template <typename T>
-void RunInnerLoop(const nssm::LossFunction<T>& context_loss, const nssm::LossData<T>& context, int32_t steps,
-                  double learning_rate, int64_t size, T* iterates, T* gradient,
-                  const typename nssm::LossFunction<T>::Scratch& scratch);
-
-/// The gradient of one task's target loss after the inner loop, with respect to the parameters before it.
+///   MAML               g = ∇L(𝓣; ω_M), pulled back through the M steps with Hessian–vector products: exact
+///   FIRST_ORDER_MAML   g = ∇L(𝓣; ω_M)
+///   SUPERVISED         g = ∇L(𝓣; ω_0)
+///   IMPLICIT_MAML      g = the gradient of L(𝓣) at the minimum of L(𝓒; ω) + ½ λ |ω − ω₀|², taken to be ω_M (ImplicitGradient)
+///   REPTILE            g = d_1 + … + d_M of an inner loop on 𝓒 ∪ 𝓣 = (ω₀ − ω_M)/β;  of parameters that do not adapt the
+///                          sum of their gradients ∇L(𝓒 ∪ 𝓣; ω_{m−1}) on the way
 ///
-///   g = ∇L(𝓣; ω_M),   then for m = M … 1:   g ← g − β H(𝓒; ω_{m−1}) P g         MAML, exact
-///   g = ∇L(𝓣; ω_M)                                                          first order
-///   g = ∇L(𝓣; ω_0)                                                          supervised
+/// L(𝓒 ∪ 𝓣) is the mean of both losses by the number of samples that each predicts. With one step of gradient descent
+/// Reptile's is the plain gradient of L(𝓒 ∪ 𝓣; ω₀), for every parameter.
 ///
-/// with P the projection onto the adapted parameters: step m is ω_m = ω_{m−1} − β P ∇L, whose transposed Jacobian
-/// is I − β H P. Every parameter has a meta-gradient; only the adapted ones move in the inner loop.
-/// Source: paper.tex eqs. maml_inner, maml_outer, anil_inner.
+/// Every parameter has a meta-gradient; only the adapted ones move in the inner loop. If rates are learned
+/// the variables are ω, then ρ_l = log β_l of every adapted tensor l, and ∂/∂ρ_l = β_l ∂/∂β_l: exact for MAML, for
+/// FIRST_ORDER_MAML −β_l ⟨∇L(𝓣; ω_M), d_1 + … + d_M⟩_l, which takes the d_m for constants.
+///
+/// Source: paper.tex eqs. maml_inner, maml_outer, anil_inner; A. Nichol, J. Achiam, J. Schulman, On First-Order
+/// Meta-Learning Algorithms, 2018, for Reptile; Z. Li et al., Meta-SGD, 2017, for the rates, there one per parameter.
 template <typename T>
 class MetaGradient {
  public:
-  /// @param steps, learning_rate  of the inner loop.
-  MetaGradient(const nssm::Model& model, const nssm::LossSpec& loss, Algorithm algorithm,
-               const nssm::LossShape& context, const nssm::LossShape& target, const nn::Mask& adapted, int32_t steps,
-               double learning_rate);
+  /// @param spec  its loss, algorithm, inner_loop and implicit_maml are read.
+  MetaGradient(const nssm::Model& model, const TrainingSpec& spec, const nssm::LossShape& context,
+               const nssm::LossShape& target, const nn::Mask& adapted);
 
-  /// Memory of one thread: M + 1 parameter vectors, and one step's activations.
+  /// Memory of one thread: what InnerLoop::Trace holds, and one step's activations.
   class Scratch {
    public:
     explicit Scratch(const MetaGradient& owner);
 
    private:
     friend class MetaGradient;
-    std::vector<T> iterates_, product_, masked_;
+    typename InnerLoop<T>::Trace trace_;
+    typename ImplicitGradient<T>::Scratch implicit_;
+    std::vector<T> target_gradient_;
+    std::vector<double> rates_, rate_adjoints_;
     typename nssm::LossFunction<T>::Scratch inner_, outer_, target_;
   };
 
-  /// @param gradient  n_ω elements, all written. @return L(𝓣; ω_M).
-  double Compute(const T* parameters, const nssm::LossData<T>& context, const nssm::LossData<T>& target, T* gradient,
+  /// n_ω, and the number of adapted tensors if rates are learned.
+  size_t variables() const;
+
+  /// @param gradient  as many elements as variables, all written.
+  /// @return L(𝓣; ω_M); of Reptile L(𝓒 ∪ 𝓣; ω_M).
+  double Compute(const T* variables, const nssm::LossData<T>& context, const nssm::LossData<T>& target, T* gradient,
                  Scratch* scratch) const;
-  /// L(𝓣; ω_M) alone.
-  double TargetLoss(const T* parameters, const nssm::LossData<T>& context, const nssm::LossData<T>& target,
+  /// L(𝓣; ω_M) alone, adapted to 𝓒.
+  double TargetLoss(const T* variables, const nssm::LossData<T>& context, const nssm::LossData<T>& target,
                     Scratch* scratch) const;
 
  private:
-  int32_t InnerSteps() const { return algorithm_ == Algorithm::kSupervised ? 0 : steps_; }
+  void ReadRates(const T* variables, Scratch* scratch) const;
   /// @return ω_M.
-  const T* Adapt(const T* parameters, const nssm::LossData<T>& context, Scratch* scratch) const;
+  const T* Adapt(const T* variables, const nssm::LossData<T>& context, Scratch* scratch) const;
+  double Reptile(const T* variables, const nssm::LossData<T>& context, const nssm::LossData<T>& target, T* gradient,
+                 Scratch* scratch) const;
+  void PullBack(const nssm::LossData<T>& context, T* gradient, Scratch* scratch) const;
+  void WriteRateGradient(T* gradient, Scratch* scratch) const;
 
   Algorithm algorithm_;
-  int32_t steps_;
-  double learning_rate_;
+  bool learned_rates_;
   int64_t size_;
-  std::vector<std::pair<int64_t, int64_t>> frozen_;  // offset and size of what does not adapt
+  std::vector<double> rates_;  // of the adapted tensors, unless they are learned
+  InnerLoop<T> loop_;
+  ImplicitGradient<T> implicit_;
   nssm::LossFunction<T> inner_;   // on the context set, adapted parameters only
-  nssm::LossFunction<T> outer_;   // on the context set, all rows of H P
+  nssm::LossFunction<T> outer_;   // on the context set, all parameters; all rows of H P
   nssm::LossFunction<T> target_;  // on the target set, all parameters
 };
 

@@ -21,6 +21,7 @@ using nssm::LossShape;
 
 constexpr int kValidationDraws = 2;          // context and target sets per held-out system
 constexpr double kTrainingLossWeight = 0.1;  // of the newest step in the running mean
+constexpr double kHopeless = 1e6;            // times the first loss: from there no training comes back
 
 /// Along half a cosine from `start` to `end` while `step` goes from 0 to steps − 1.
 double CosineDecay(double start, double end, int32_t step, int32_t steps) {
@@ -56,10 +57,9 @@ class Phase {
         executor_(executor),
         context_shape_(*nssm::ShapeOfLoss(spec.model, spec.loss, spec.context_samples)),
         target_shape_(*nssm::ShapeOfLoss(spec.model, spec.loss, spec.target_samples)),
-        meta_gradient_(model, spec.loss, spec.algorithm, context_shape_, target_shape_, mask, spec.inner_loop.steps,
-                       spec.inner_loop.learning_rate) {
+        meta_gradient_(model, spec, context_shape_, target_shape_, mask) {
     for (size_t slot = 0; slot < executor->concurrency(); ++slot) scratch_.emplace_back(meta_gradient_);
-    gradients_.assign(static_cast<size_t>(spec.task_batch), std::vector<T>(static_cast<size_t>(model.layout().size())));
+    gradients_.assign(static_cast<size_t>(spec.task_batch), std::vector<T>(meta_gradient_.variables()));
   }
 
   /// Mean loss and meta-gradient over the tasks of one outer step.
@@ -120,68 +120,128 @@ class Phase {
   std::vector<std::vector<T>> gradients_;
 };
 
-absl::Status Diverged(int32_t iteration, double loss, double norm) {
-  return absl::OutOfRangeError(
-      absl::StrCat("the training diverged at iteration ", iteration, ": loss ", base::FormatShort(loss), ", gradient norm ",
-                   base::FormatShort(norm), "; a smaller inner_loop.learning_rate or outer_lr may help"));
+/// Names in TrainingState::values.
+constexpr char kParameters[] = "parameters", kFirstMoment[] = "first_moment", kSecondMoment[] = "second_moment",
+               kBest[] = "best_parameters", kFirstLoss[] = "first_loss";
+
+absl::Status Diverged(const TrainingSpec& spec, int32_t iteration, double loss, double norm, const TrainingState& good) {
+  const std::string best = std::isfinite(good.best_validation_loss)
+                               ? absl::StrCat(" and the best so far (validation loss ", base::FormatShort(good.best_validation_loss), ")")
+                               : "";
+  return absl::OutOfRangeError(absl::StrCat(
+      "the training diverged at iteration ", iteration, ": loss ", base::FormatShort(loss), ", gradient norm ",
+      base::FormatShort(norm), "; the last good state is that after iteration ", good.iteration, ", its checkpoint holds it", best,
+      "; a smaller outer_lr (now ", base::FormatShort(spec.outer_lr), "), inner_loop.learning_rate (now ",
+      base::FormatShort(spec.inner_loop.learning_rate), ") or clip_norm may help"));
 }
 
+/// The best or last variables, taken apart.
+LearnedStart TakeApart(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
+                       const std::vector<double>& variables) {
+  const auto rates = variables.begin() + model.layout().size();
+  LearnedStart result{.parameters = std::vector<double>(variables.begin(), rates)};
+  if (!spec.inner_loop.learned_rates) return result;
+  auto rate = rates;
+  for (size_t i = 0; i < mask.size(); ++i) {
+    if (mask[i]) result.tensor_rates[model.layout().tensors()[i].name] = std::exp(*rate++);
+  }
+  return result;
+}
+
+/// One training, from its state on.
 template <typename T>
-absl::StatusOr<std::vector<double>> Run(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
-                          const Systems& systems, base::Executor* executor, TrainingState* state,
-                          const OnTrainingStep& on_step) {
-  Phase<T> main(spec, model, mask, systems, executor);
-  std::optional<Phase<T>> warmup;
-  if (state->iteration < spec.warmup_iterations) warmup.emplace(WarmupSpec(spec), model, mask, systems, executor);
-  std::vector<double>& parameters = state->values["parameters"];
-  std::vector<double>& first_moment = state->values["first_moment"];
-  std::vector<double>& second_moment = state->values["second_moment"];
-  std::vector<double>& best = state->values["best_parameters"];
-  std::vector<double> gradient;
-  while (state->iteration < spec.iterations) {
-    const bool warming_up = state->iteration < spec.warmup_iterations;
-    if (state->iteration == spec.warmup_iterations) {
+class OuterLoop {
+ public:
+  OuterLoop(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask, const Systems& systems,
+            base::Executor* executor, TrainingState* state)
+      : spec_(spec), systems_(systems), state_(state), main_(spec, model, mask, systems, executor) {
+    if (state->iteration < spec.warmup_iterations) warmup_.emplace(WarmupSpec(spec), model, mask, systems, executor);
+  }
+
+  /// Errors: those of RunOuterLoop.
+  absl::Status Run(const OnTrainingStep& on_step) {
+    while (state_->iteration < spec_.iterations) {
+      const absl::Status stepped = Step();
+      if (!stepped.ok()) {
+        if (on_step) on_step({.state = *state_, .iterations = spec_.iterations, .diverged = true});
+        return stepped;
+      }
+      const bool validate = !systems_.validation.empty() && (state_->iteration % spec_.validation_period == 0 ||
+                                                             state_->iteration == spec_.iterations);
+      if (validate) Validate();
+      if (on_step && !on_step({*state_, spec_.iterations, validate})) return absl::CancelledError("the training was cancelled");
+    }
+    return absl::OkStatus();
+  }
+
+ private:
+  absl::Status Step() {
+    std::vector<double>& parameters = state_->values[kParameters];
+    std::vector<double>& first_moment = state_->values[kFirstMoment];
+    std::vector<double>& second_moment = state_->values[kSecondMoment];
+    const bool warming_up = state_->iteration < spec_.warmup_iterations;
+    if (state_->iteration == spec_.warmup_iterations) {
       // Another loss: the warm-up's squared gradients would throttle the first thousand steps on it.
       std::fill(first_moment.begin(), first_moment.end(), 0.0);
       std::fill(second_moment.begin(), second_moment.end(), 0.0);
     }
-    const double loss = (warming_up ? *warmup : main).Gradient(state->iteration, parameters, &gradient);
-    const double norm = ClipNorm(spec.clip_norm, &gradient);
-    if (!std::isfinite(loss) || !std::isfinite(norm)) return Diverged(state->iteration + 1, loss, norm);
-    const double rate = LearningRate(spec, state->iteration);
-    ++state->iteration;
-    const int32_t step = warming_up ? state->iteration : state->iteration - spec.warmup_iterations;
-    AdamStep(gradient, step, rate, &first_moment, &second_moment, &parameters);
-    nssm::RoundToPrecision(spec.model.precision, &parameters);
-    state->training_loss = step == 1 ? loss : state->training_loss + kTrainingLossWeight * (loss - state->training_loss);
-    const bool validate = !systems.validation.empty() && (state->iteration % spec.validation_period == 0 ||
-                                                          state->iteration == spec.iterations);
-    if (validate) {
-      state->validation_loss = main.ValidationLoss(parameters);
-      if (state->validation_loss < state->best_validation_loss) {
-        state->best_validation_loss = state->validation_loss;
-        best = parameters;
-      }
+    const double loss = (warming_up ? *warmup_ : main_).Gradient(state_->iteration, parameters, &gradient_);
+    const double norm = ClipNorm(spec_.clip_norm, &gradient_);
+    const int32_t step = state_->iteration + 1 - (warming_up ? 0 : spec_.warmup_iterations);
+    const double first_loss = step == 1 ? loss : state_->values[kFirstLoss].front();
+    const double mean_loss = step == 1 ? loss : state_->training_loss + kTrainingLossWeight * (loss - state_->training_loss);
+    if (!std::isfinite(loss) || !std::isfinite(norm) || mean_loss > kHopeless * std::max(1.0, first_loss)) {
+      const int32_t iteration = state_->iteration + 1;
+      if (good_) *state_ = *std::move(good_);
+      return Diverged(spec_, iteration, loss, norm, *state_);
     }
-    if (on_step && !on_step({*state, spec.iterations, validate})) return absl::CancelledError("the training was cancelled");
+    good_ = *state_;
+    state_->values[kFirstLoss].front() = first_loss;
+    state_->training_loss = mean_loss;
+    const double rate = LearningRate(spec_, state_->iteration);
+    ++state_->iteration;
+    AdamStep(gradient_, step, rate, &first_moment, &second_moment, &parameters);
+    nssm::RoundToPrecision(spec_.model.precision, &parameters);
+    return absl::OkStatus();
   }
-  return systems.validation.empty() ? parameters : best;
-}
+
+  void Validate() {
+    const std::vector<double>& parameters = state_->values[kParameters];
+    state_->validation_loss = main_.ValidationLoss(parameters);
+    if (!(state_->validation_loss < state_->best_validation_loss)) return;
+    state_->best_validation_loss = state_->validation_loss;
+    state_->values[kBest] = parameters;
+  }
+
+  const TrainingSpec& spec_;
+  const Systems& systems_;
+  TrainingState* state_;
+  std::optional<TrainingState> good_;  // at the newest loss and gradient that were numbers
+  Phase<T> main_;
+  std::optional<Phase<T>> warmup_;
+  std::vector<double> gradient_;
+};
 
 /// A state to begin with, or to go on from if it has what the loop needs.
-absl::Status Prepare(const TrainingSpec& spec, const nssm::Model& model, TrainingState* state) {
-  const size_t size = static_cast<size_t>(model.layout().size());
+absl::Status Prepare(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask, TrainingState* state) {
+  std::vector<double> parameters = model.InitialParameters(spec.seed);
+  if (spec.inner_loop.learned_rates) {
+    const std::vector<double> rates = RatesOfTensors(spec.inner_loop, model.layout());
+    for (size_t i = 0; i < mask.size(); ++i) {
+      if (mask[i]) parameters.push_back(std::log(rates[i]));
+    }
+  }
+  nssm::RoundToPrecision(spec.model.precision, &parameters);
+  const std::vector<double> zeros(parameters.size());
+  const std::map<std::string, std::vector<double>> fresh = {{kParameters, parameters}, {kFirstMoment, zeros},
+                                                            {kSecondMoment, zeros},    {kBest, parameters},
+                                                            {kFirstLoss, {0}}};
   if (state->values.empty()) {
-    std::vector<double> parameters = model.InitialParameters(spec.seed);
-    nssm::RoundToPrecision(spec.model.precision, &parameters);
-    state->values = {{"parameters", parameters},
-                     {"first_moment", std::vector<double>(size)},
-                     {"second_moment", std::vector<double>(size)},
-                     {"best_parameters", parameters}};
+    state->values = fresh;
     state->best_validation_loss = state->validation_loss = std::numeric_limits<double>::infinity();
   }
-  for (const char* name : {"parameters", "first_moment", "second_moment", "best_parameters"}) {
-    if (state->values[name].size() != size) {
+  for (const auto& [name, values] : fresh) {
+    if (state->values[name].size() != values.size()) {
       return absl::InvalidArgumentError(absl::StrCat("the checkpoint's \"", name, "\" is not the model's"));
     }
   }
@@ -190,13 +250,14 @@ absl::Status Prepare(const TrainingSpec& spec, const nssm::Model& model, Trainin
 
 }  // namespace
 
-absl::StatusOr<std::vector<double>> RunOuterLoop(const TrainingSpec& spec, const nssm::Model& model,
-                                                 const nn::Mask& mask, const Systems& systems, base::Executor* executor,
-                                                 TrainingState* state, const OnTrainingStep& on_step) {
-  METAEKF_RETURN_IF_ERROR(Prepare(spec, model, state));
-  return spec.model.precision == nssm::Precision::kFloat32
-             ? Run<float>(spec, model, mask, systems, executor, state, on_step)
-             : Run<double>(spec, model, mask, systems, executor, state, on_step);
+absl::StatusOr<LearnedStart> RunOuterLoop(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
+                                          const Systems& systems, base::Executor* executor, TrainingState* state,
+                                          const OnTrainingStep& on_step) {
+  METAEKF_RETURN_IF_ERROR(Prepare(spec, model, mask, state));
+  METAEKF_RETURN_IF_ERROR(spec.model.precision == nssm::Precision::kFloat32
+                              ? OuterLoop<float>(spec, model, mask, systems, executor, state).Run(on_step)
+                              : OuterLoop<double>(spec, model, mask, systems, executor, state).Run(on_step));
+  return TakeApart(spec, model, mask, state->values[systems.validation.empty() ? kParameters : kBest]);
 }
 
 }  // namespace metaekf::meta

@@ -1,5 +1,7 @@
 #pragma once
 
+#include <map>
+#include <string>
 #include <vector>
 
 #include "absl/status/statusor.h"
@@ -16,16 +18,27 @@ struct Systems {
   std::vector<data::Trajectory> training, validation;
 };
 
+struct LearnedStart {
+  std::vector<double> parameters;              ///< ω
+  std::map<std::string, double> tensor_rates;  ///< β by tensor, if they are learned
+};
+
 /// The outer loop of the gradient-based algorithms (paper.tex algorithm alg:maml).
 ///
 /// Each step draws `task_batch` systems, from each a context and a target set of consecutive samples anywhere in its
 /// trajectory, independently; takes the mean of their meta-gradients, clips it and makes an Adam step. Held-out systems
 /// judge the model every `validation_period` steps.
 ///
-/// @return ω: the best on validation, the last if there is no validation.
+/// The state's "parameters" and "best_parameters" are the variables of MetaGradient: ω, then log β of every adapted tensor
+/// if rates are learned. Both move by the same Adam step and count in the norm that is clipped.
+///
+/// A training diverges when a loss or gradient is no number, or the running mean of the loss is a million times what the
+/// phase began with (and 1). The state then goes back to before the step that led there, and on_step hears of it once more.
+///
+/// @return the best on validation, the last if there is no validation.
 /// Errors: Cancelled if on_step said so; OutOfRange when the training diverges, with the reason.
-absl::StatusOr<std::vector<double>> RunOuterLoop(const TrainingSpec& spec, const nssm::Model& model,
-                                                 const nn::Mask& mask, const Systems& systems, base::Executor* executor,
-                                                 TrainingState* state, const OnTrainingStep& on_step);
+absl::StatusOr<LearnedStart> RunOuterLoop(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
+                                          const Systems& systems, base::Executor* executor, TrainingState* state,
+                                          const OnTrainingStep& on_step);
 
 }  // namespace metaekf::meta

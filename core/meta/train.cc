@@ -9,6 +9,7 @@
 #include "core/filter/noise.h"
 #include "core/meta/adapt.h"
 #include "core/meta/empirical_bayes.h"
+#include "core/meta/inner_loop.h"
 #include "core/meta/outer_loop.h"
 #include "core/nssm/loss.h"
 
@@ -59,7 +60,7 @@ absl::Status FitSpecToData(const Dataset& fleet, TrainingSpec* spec) {
     return absl::InvalidArgumentError("the sample period is unknown: neither the data has times nor the spec sample_period_s");
   }
   // The spec is read again whole, for what it says about curl-free outputs depends on the sizes.
-  return nssm::ReadModelSpec(base::JsonFields(nssm::ToJson(model), "model")).status();
+  return ReadTrainingSpec(ToJson(*spec)).status();
 }
 
 /// A field stays free of curl through the normalisation only if its components share a scale, and so do the positions.
@@ -91,6 +92,15 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(const Bundle& bundle, con
   return noise.Result(bundle.normaliser);
 }
 
+/// The rates that were learned become part of what the model file says of its training and of adaptation.
+void KeepRates(const std::map<std::string, double>& rates, TrainingSpec* spec) {
+  if (rates.empty()) return;
+  spec->inner_loop.tensor_rates = rates;
+  if (spec->adaptation.learned_rates && spec->adaptation.optimiser == spec->inner_loop.optimiser) {
+    spec->adaptation.tensor_rates = rates;
+  }
+}
+
 std::vector<Trajectory> Pick(const std::vector<Trajectory>& from, const std::vector<size_t>& indices) {
   std::vector<Trajectory> picked;
   for (const size_t i : indices) picked.push_back(from[i]);
@@ -113,6 +123,8 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
   METAEKF_ASSIGN_OR_RETURN(const nssm::Model model, nssm::Model::Create(spec.model));
   METAEKF_ASSIGN_OR_RETURN(const nn::Mask mask, nn::ParseMask(spec.inner_loop.adapted_mask, model.layout()));
   METAEKF_RETURN_IF_ERROR(nn::ParseMask(spec.adaptation.adapted_mask, model.layout()).status());
+  METAEKF_RETURN_IF_ERROR(CheckTensorRates(spec.inner_loop, model.layout()));
+  METAEKF_RETURN_IF_ERROR(CheckTensorRates(spec.adaptation, model.layout()));
   METAEKF_ASSIGN_OR_RETURN(const data::Split split,
                            data::SplitSystems(fleet.trajectories.size(), spec.validation_share, spec.seed));
 
@@ -137,7 +149,9 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
     bundle.parameters = std::move(learned.parameters);
     bundle.prior = std::move(learned.prior);
   } else {
-    METAEKF_ASSIGN_OR_RETURN(bundle.parameters, RunOuterLoop(spec, model, mask, systems, executor, &state, on_step));
+    METAEKF_ASSIGN_OR_RETURN(LearnedStart learned, RunOuterLoop(spec, model, mask, systems, executor, &state, on_step));
+    bundle.parameters = std::move(learned.parameters);
+    KeepRates(learned.tensor_rates, &spec);
   }
   bundle.normaliser = normaliser;
   bundle.sample_period_s = spec.sample_period_s;

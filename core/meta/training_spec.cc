@@ -10,7 +10,8 @@ using nlohmann::json;
 
 const std::vector<std::pair<std::string, Algorithm>> kAlgorithms = {
     {"MAML", Algorithm::kMaml}, {"FIRST_ORDER_MAML", Algorithm::kFirstOrderMaml}, {"SUPERVISED", Algorithm::kSupervised},
-    {"GAUSSIAN_PRIOR", Algorithm::kGaussianPrior}};
+    {"GAUSSIAN_PRIOR", Algorithm::kGaussianPrior}, {"REPTILE", Algorithm::kReptile},
+    {"IMPLICIT_MAML", Algorithm::kImplicitMaml}};
 
 const std::vector<std::pair<std::string, Optimiser>> kOptimisers = {{"GRADIENT_DESCENT", Optimiser::kGradientDescent},
                                                                     {"ADAM", Optimiser::kAdam},
@@ -19,6 +20,8 @@ const std::vector<std::pair<std::string, Optimiser>> kOptimisers = {{"GRADIENT_D
 constexpr int32_t kGaussianPriorSteps = 60;  // of Levenberg–Marquardt at adaptation
 
 constexpr int32_t kMany = 100'000'000;
+
+constexpr double kSmallestRate = 1e-12, kLargestRate = 1e6;
 
 template <typename Enum>
 std::string NameOf(const std::vector<std::pair<std::string, Enum>>& names, Enum value) {
@@ -31,10 +34,18 @@ std::string NameOf(const std::vector<std::pair<std::string, Enum>>& names, Enum 
 InnerLoopSpec ReadInnerLoop(JsonFields* parent, const std::string& name, InnerLoopSpec spec) {
   JsonFields fields = parent->Object(name);
   spec.steps = static_cast<int32_t>(fields.Integer("steps", spec.steps, 0, 1'000'000));
-  spec.learning_rate = fields.Number("learning_rate", spec.learning_rate, 0, 1e6);
+  spec.learning_rate = fields.Number("learning_rate", spec.learning_rate, 0, kLargestRate);
   spec.adapted_mask = fields.String("adapted_mask", spec.adapted_mask);
+  const Optimiser default_optimiser = spec.optimiser;
   spec.optimiser = fields.Choice("optimiser", spec.optimiser, kOptimisers);
+  if (spec.optimiser != default_optimiser) {
+    // The rates of one optimiser are nothing to another.
+    spec.learned_rates = false;
+    spec.tensor_rates.clear();
+  }
   spec.proximal = fields.Number("proximal", spec.proximal, 0, 1e12);
+  spec.learned_rates = fields.Bool("learned_rates", spec.learned_rates);
+  if (fields.Has("tensor_rates")) spec.tensor_rates = fields.NumbersByName("tensor_rates", kSmallestRate, kLargestRate);
   parent->Include(fields.Finish());
   return spec;
 }
@@ -44,7 +55,9 @@ json InnerLoopJson(const InnerLoopSpec& spec) {
           {"learning_rate", spec.learning_rate},
           {"adapted_mask", spec.adapted_mask},
           {"optimiser", NameOf(kOptimisers, spec.optimiser)},
-          {"proximal", spec.proximal}};
+          {"proximal", spec.proximal},
+          {"learned_rates", spec.learned_rates},
+          {"tensor_rates", spec.tensor_rates}};
 }
 
 GaussianPriorSpec ReadGaussianPrior(JsonFields* parent) {
@@ -63,6 +76,36 @@ GaussianPriorSpec ReadGaussianPrior(JsonFields* parent) {
   return spec;
 }
 
+ImplicitMamlSpec ReadImplicitMaml(JsonFields* parent) {
+  ImplicitMamlSpec spec;
+  JsonFields fields = parent->Object("implicit_maml");
+  const int32_t steps = static_cast<int32_t>(fields.Integer("cg_steps", spec.cg_steps, 0, 1'000'000));
+  if (steps > 0) spec.cg_steps = steps;
+  spec.cg_tolerance = fields.Number("cg_tolerance", spec.cg_tolerance, 0, 1);
+  parent->Include(fields.Finish());
+  return spec;
+}
+
+/// What the algorithms ask of their inner loop.
+void CheckInnerLoop(const TrainingSpec& spec, JsonFields* fields) {
+  const InnerLoopSpec& inner = spec.inner_loop;
+  if (inner.optimiser == Optimiser::kLevenbergMarquardt) {
+    fields->Fail("inner_loop.optimiser", "LEVENBERG_MARQUARDT is for adaptation; GRADIENT_DESCENT and ADAM train");
+  }
+  if (inner.learned_rates && spec.algorithm != Algorithm::kMaml && spec.algorithm != Algorithm::kFirstOrderMaml) {
+    fields->Fail("inner_loop.learned_rates", "only MAML and FIRST_ORDER_MAML have a gradient for the rates");
+  }
+  if (inner.learned_rates && inner.learning_rate < kSmallestRate) {
+    fields->Fail("inner_loop.learning_rate", "learned rates begin with it, so it must be positive");
+  }
+  if (spec.algorithm == Algorithm::kReptile && inner.steps == 0) {
+    fields->Fail("inner_loop.steps", "REPTILE learns from the inner steps and needs one at least");
+  }
+  if (spec.algorithm == Algorithm::kImplicitMaml && inner.proximal == 0) {
+    fields->Fail("inner_loop.proximal", "must be positive for IMPLICIT_MAML");
+  }
+}
+
 }  // namespace
 
 absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
@@ -72,10 +115,9 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
   METAEKF_ASSIGN_OR_RETURN(spec.loss, nssm::ReadLossSpec(fields.Object("loss"), spec.model));
   spec.algorithm = fields.Choice("algorithm", Algorithm::kMaml, kAlgorithms);
   spec.inner_loop = ReadInnerLoop(&fields, "inner_loop", InnerLoopSpec());
-  if (spec.inner_loop.optimiser != Optimiser::kGradientDescent) {
-    fields.Fail("inner_loop.optimiser", "the inner loop of training is GRADIENT_DESCENT; the others are for adaptation");
-  }
+  CheckInnerLoop(spec, &fields);
   spec.gaussian_prior = ReadGaussianPrior(&fields);
+  spec.implicit_maml = ReadImplicitMaml(&fields);
   InnerLoopSpec adaptation = spec.inner_loop;
   if (spec.algorithm == Algorithm::kGaussianPrior) {
     adaptation.optimiser = Optimiser::kLevenbergMarquardt;
@@ -116,6 +158,7 @@ json ToJson(const TrainingSpec& spec) {
             {"restarts", spec.gaussian_prior.restarts},
             {"first_steps", spec.gaussian_prior.first_steps},
             {"round_steps", spec.gaussian_prior.round_steps}}},
+          {"implicit_maml", {{"cg_steps", spec.implicit_maml.cg_steps}, {"cg_tolerance", spec.implicit_maml.cg_tolerance}}},
           {"context_samples", spec.context_samples},
           {"target_samples", spec.target_samples},
           {"task_batch", spec.task_batch},

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <map>
 #include <nlohmann/json.hpp>
 #include <string>
 
@@ -8,7 +9,7 @@
 
 namespace metaekf::meta {
 
-enum class Algorithm { kMaml, kFirstOrderMaml, kSupervised, kGaussianPrior };
+enum class Algorithm { kMaml, kFirstOrderMaml, kSupervised, kGaussianPrior, kReptile, kImplicitMaml };
 
 enum class Optimiser { kGradientDescent, kAdam, kLevenbergMarquardt };
 
@@ -17,8 +18,10 @@ struct InnerLoopSpec {
   int32_t steps = 10;
   double learning_rate = 0.01;
   std::string adapted_mask = "*";
-  Optimiser optimiser = Optimiser::kGradientDescent;  ///< the others at adaptation only
-  double proximal = 1;  ///< λ of kLevenbergMarquardt where no prior has been learned
+  Optimiser optimiser = Optimiser::kGradientDescent;
+  double proximal = 1;  ///< λ of kImplicitMaml, and of kLevenbergMarquardt where no prior has been learned
+  bool learned_rates = false;
+  std::map<std::string, double> tensor_rates;  ///< by the tensor's name; the others' is learning_rate
 };
 
 /// Empirical Bayes: the message GaussianPriorSpec of spec.proto.
@@ -30,6 +33,12 @@ struct GaussianPriorSpec {
   int32_t round_steps = 10;
 };
 
+/// The message ImplicitMamlSpec of spec.proto.
+struct ImplicitMamlSpec {
+  int32_t cg_steps = 10;
+  double cg_tolerance = 1e-6;
+};
+
 /// How a model is meta-trained: the message TrainingSpec of spec.proto, where each field is described.
 struct TrainingSpec {
   nssm::ModelSpec model;
@@ -38,6 +47,7 @@ struct TrainingSpec {
   InnerLoopSpec inner_loop;
   InnerLoopSpec adaptation;
   GaussianPriorSpec gaussian_prior;
+  ImplicitMamlSpec implicit_maml;
   int32_t context_samples = 100;
   int32_t target_samples = 100;
   int32_t task_batch = 8;

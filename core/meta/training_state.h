@@ -29,6 +29,7 @@ struct TrainingProgress {
   const TrainingState& state;
   int32_t iterations = 0;
   bool validated = false;  ///< a validation has just been made
+  bool diverged = false;   ///< the training ends here; the state is the last good one
 };
 
 /// False stops the training.

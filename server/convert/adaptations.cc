@@ -86,6 +86,7 @@ absl::StatusOr<meta::AdaptationOptions> ResolveOptions(const v1::AdaptRequest::O
                             absl::StrCat("is ", base::FormatExact(rate), ", must be positive"));
     }
     options.inner_loop.learning_rate = rate;
+    options.inner_loop.tensor_rates.clear();  // one rate is asked for
   }
   if (!inner_loop.adapted_mask().empty()) {
     options.inner_loop.adapted_mask = inner_loop.adapted_mask();

@@ -6,6 +6,7 @@
 #include "absl/strings/str_cat.h"
 #include "core/base/numbers.h"
 #include "core/base/status.h"
+#include "core/meta/inner_loop.h"
 #include "core/nssm/loss.h"
 #include "server/convert/channels.h"
 #include "server/convert/spec.h"
@@ -51,6 +52,10 @@ absl::Status CheckModel(const meta::TrainingSpec& spec) {
   METAEKF_RETURN_IF_ERROR(
       InField(absl::StrCat(kSpec, ".adaptation.adapted_mask"),
               nn::ParseMask(spec.adaptation.adapted_mask, model.layout()).status()));
+  METAEKF_RETURN_IF_ERROR(InField(absl::StrCat(kSpec, ".inner_loop"),
+                                  meta::CheckTensorRates(spec.inner_loop, model.layout())));
+  METAEKF_RETURN_IF_ERROR(InField(absl::StrCat(kSpec, ".adaptation"),
+                                  meta::CheckTensorRates(spec.adaptation, model.layout())));
   const auto check_set = [&spec](const std::string& field, int32_t samples) {
     return base::Annotate(nssm::ShapeOfLoss(spec.model, spec.loss, samples).status(),
                           absl::StrCat(kSpec, ".", field));

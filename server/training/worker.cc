@@ -101,7 +101,8 @@ class Attempt {
     const bool last = progress.state.iteration == progress.iterations;
     Report(progress, last ? "measuring the noise" : "meta-training");
     const absl::Duration period = absl::Seconds(options_.checkpoint_period_s);
-    if (stop || last || absl::Now() - last_checkpoint_ >= period) WriteCheckpoint(progress.state);
+    const bool due = absl::Now() - last_checkpoint_ >= period;
+    if (stop || last || due || progress.diverged) WriteCheckpoint(progress.state);
     return !stop;
   }
 

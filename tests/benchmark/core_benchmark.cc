@@ -82,15 +82,19 @@ MetaSeconds LocalisationLearning() {
   const nn::Mask adapted = *nn::ParseMask("encoder.5-6,transition,*_decoder", model.layout());
   const nssm::LossFunction<float> context_loss(model, loss, shape, adapted, adapted);
   const auto scratch = context_loss.MakeScratch();
-  std::vector<float> iterates(static_cast<size_t>(size) * (kSteps + 1)), gradient(static_cast<size_t>(size));
-  std::copy(parameters.begin(), parameters.end(), iterates.begin());
-  seconds.adapt = MedianSeconds(7, [&] {
-    meta::RunInnerLoop(context_loss, context, kSteps, 1e-6, size, iterates.data(), gradient.data(), scratch);
-  });
+  std::vector<float> gradient(static_cast<size_t>(size));
+  const meta::InnerLoop<float> loop(model.layout(), adapted, meta::Optimiser::kGradientDescent, kSteps, 0,
+                                    meta::InnerRecord::kResult);
+  meta::InnerLoop<float>::Trace trace(loop);
+  const std::vector<double> rates(loop.tensors(), 1e-6);
+  const auto context_gradient = [&](const float* at, float* result) { context_loss.Gradient(at, context, result, scratch); };
+  seconds.adapt = MedianSeconds(7, [&] { loop.Run(parameters.data(), rates, context_gradient, &trace); });
   const nn::Mask all(model.layout().tensors().size(), true);
   for (const bool second_order : {true, false}) {
-    const meta::MetaGradient<float> meta(model, loss, second_order ? meta::Algorithm::kMaml : meta::Algorithm::kFirstOrderMaml,
-                                         shape, shape, all, kSteps, 1e-3);
+    meta::TrainingSpec training{.loss = loss};
+    training.algorithm = second_order ? meta::Algorithm::kMaml : meta::Algorithm::kFirstOrderMaml;
+    training.inner_loop = {.steps = kSteps, .learning_rate = 1e-3};
+    const meta::MetaGradient<float> meta(model, training, shape, shape, all);
     meta::MetaGradient<float>::Scratch meta_scratch(meta);
     (second_order ? seconds.maml : seconds.fomaml) = MedianSeconds(
         5, [&] { meta.Compute(parameters.data(), context, target, gradient.data(), &meta_scratch); });

@@ -74,8 +74,9 @@ TEST(GoldenTest, LossGradientHessianAndMetaGradientMatchPyTorch) {
     function.HessianVector(parameters.data(), context, direction.data(), result.data(), scratch);
     ExpectClose(result, Flat(c["hessian_vector"], model.layout()), "Hessian-vector product");
 
-    const meta::MetaGradient<double> meta_gradient(model, loss, meta::Algorithm::kMaml, shape, shape, all,
-                                                   c["inner_steps"].get<int32_t>(), c["inner_lr"].get<double>());
+    meta::TrainingSpec training{.loss = loss};
+    training.inner_loop = {.steps = c["inner_steps"].get<int32_t>(), .learning_rate = c["inner_lr"].get<double>()};
+    const meta::MetaGradient<double> meta_gradient(model, training, shape, shape, all);
     meta::MetaGradient<double>::Scratch meta_scratch(meta_gradient);
     EXPECT_NEAR(meta_gradient.Compute(parameters.data(), context, target, result.data(), &meta_scratch),
                 c["target_value"].get<double>(), 1e-12);

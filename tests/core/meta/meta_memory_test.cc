@@ -31,7 +31,8 @@ Measured Measure(int32_t steps) {
   const size_t before_gradient = HeapInUse();
   const auto gradient_scratch = loss.MakeScratch();
   const size_t gradient = HeapInUse() - before_gradient;
-  const MetaGradient<double> meta(model, c.loss, Algorithm::kMaml, shape, shape, all, steps, 0.01);
+  const TrainingSpec training{.loss = c.loss, .inner_loop = {.steps = steps}};
+  const MetaGradient<double> meta(model, training, shape, shape, all);
   const size_t before = HeapInUse();
   const MetaGradient<double>::Scratch scratch(meta);
   return {HeapInUse() - before, gradient, sizeof(double) * static_cast<size_t>(model.layout().size())};

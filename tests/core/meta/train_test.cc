@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cmath>
 
 #include "core/meta/adapt.h"
@@ -63,15 +64,48 @@ std::string TrainedFile(const TrainingSpec& spec, size_t threads, const Training
   return bundle.ok() ? nssm::WriteModelFile(*bundle) : "";
 }
 
-TEST(TrainTest, TheResultIsBitIdenticalWhateverTheNumberOfThreads) {
-  EXPECT_EQ(TrainedFile(SmallSpec(), 1), TrainedFile(SmallSpec(), 3));
-  TrainingSpec narrow = SmallSpec();
+struct Variant {
+  std::string name;
+  TrainingSpec spec;
+};
+
+/// Every algorithm of the outer loop with every inner loop that it takes.
+std::vector<Variant> Variants() {
+  std::vector<Variant> variants;
+  const auto add = [&](const std::string& name, Algorithm algorithm, Optimiser optimiser, bool learned_rates) {
+    TrainingSpec spec = SmallSpec();
+    spec.algorithm = algorithm;
+    spec.inner_loop.optimiser = spec.adaptation.optimiser = optimiser;
+    spec.inner_loop.learned_rates = spec.adaptation.learned_rates = learned_rates;
+    if (algorithm == Algorithm::kImplicitMaml) spec.inner_loop.proximal = 30;  // three steps come near the minimum
+    variants.push_back({name + (learned_rates ? "WithRates" : ""), spec});
+  };
+  for (const auto& [suffix, optimiser] : {std::pair{"", Optimiser::kGradientDescent}, {"WithAdam", Optimiser::kAdam}}) {
+    add(std::string("Maml") + suffix, Algorithm::kMaml, optimiser, false);
+    add(std::string("Maml") + suffix, Algorithm::kMaml, optimiser, true);
+    add(std::string("FirstOrderMaml") + suffix, Algorithm::kFirstOrderMaml, optimiser, true);
+    add(std::string("Reptile") + suffix, Algorithm::kReptile, optimiser, false);
+    add(std::string("ImplicitMaml") + suffix, Algorithm::kImplicitMaml, optimiser, false);
+  }
+  add("FirstOrderMaml", Algorithm::kFirstOrderMaml, Optimiser::kGradientDescent, false);
+  add("Supervised", Algorithm::kSupervised, Optimiser::kGradientDescent, false);
+  return variants;
+}
+
+class EveryAlgorithmTest : public ::testing::TestWithParam<Variant> {};
+
+INSTANTIATE_TEST_SUITE_P(TrainTest, EveryAlgorithmTest, ::testing::ValuesIn(Variants()),
+                         [](const auto& variant) { return variant.param.name; });
+
+TEST_P(EveryAlgorithmTest, IsBitIdenticalWhateverTheNumberOfThreads) {
+  TrainingSpec narrow = GetParam().spec;
   narrow.model.precision = nssm::Precision::kFloat32;
+  EXPECT_EQ(TrainedFile(GetParam().spec, 1), TrainedFile(GetParam().spec, 3));
   EXPECT_EQ(TrainedFile(narrow, 1), TrainedFile(narrow, 2));
 }
 
-TEST(TrainTest, AResumedTrainingEqualsAnUninterruptedOne) {
-  const TrainingSpec spec = SmallSpec();
+TEST_P(EveryAlgorithmTest, ResumedEqualsUninterrupted) {
+  const TrainingSpec& spec = GetParam().spec;
   const auto executor = base::MakeSerialExecutor();
   for (const int32_t stop : {7, 10, 21}) {  // in the warm-up, at its end, behind it
     std::string checkpoint;
@@ -84,6 +118,93 @@ TEST(TrainTest, AResumedTrainingEqualsAnUninterruptedOne) {
     ASSERT_TRUE(state.ok()) << state.status();
     EXPECT_EQ(TrainedFile(spec, 2, &*state), TrainedFile(spec, 1)) << "stopped at " << stop;
   }
+}
+
+TEST_P(EveryAlgorithmTest, LowersTheLossOfHeldOutSystems) {
+  TrainingSpec spec = GetParam().spec;
+  spec.iterations = 200;
+  std::vector<double> losses;
+  const auto executor = base::MakeThreadExecutor(2);
+  const absl::Status status = Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), [&](const TrainingProgress& p) {
+                                if (p.validated) losses.push_back(p.state.validation_loss);
+                                return true;
+                              }).status();
+  ASSERT_TRUE(status.ok()) << status;
+  EXPECT_LT(losses.back(), 0.5 * losses.front());
+}
+
+TEST(TrainTest, LearnedRatesGoIntoTheModelFileAndAreAdaptedWith) {
+  TrainingSpec spec = SmallSpec();
+  spec.inner_loop.learned_rates = spec.adaptation.learned_rates = true;
+  spec.iterations = 60;
+  const auto executor = base::MakeSerialExecutor();
+  const absl::StatusOr<nssm::Bundle> trained = Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), nullptr);
+  ASSERT_TRUE(trained.ok()) << trained.status();
+  const nssm::Bundle bundle = *nssm::ReadModelFile(nssm::WriteModelFile(*trained));
+  const AdaptationOptions options = *DefaultAdaptation(bundle);
+  const std::map<std::string, double>& rates = options.inner_loop.tensor_rates;
+  ASSERT_EQ(rates.size(), 4u);  // weights and biases of the transition's two layers
+  for (const auto& [name, rate] : rates) {
+    EXPECT_EQ(name.rfind("transition.", 0), 0u) << name;
+    EXPECT_GT(rate, 0);
+    EXPECT_NE(rate, 0.02);
+  }
+  const Trajectory system = Fleet(1, 60, 3).trajectories[0];
+  AdaptationOptions one_rate = options;
+  one_rate.inner_loop.tensor_rates.clear();
+  EXPECT_NE(*AdaptedParameters(bundle, system, options), *AdaptedParameters(bundle, system, one_rate));
+  EXPECT_TRUE(DefaultAdaptation(bundle, AdaptationMethod::kAdam)->inner_loop.tensor_rates.empty());
+  AdaptationOptions unknown = options;
+  unknown.inner_loop.tensor_rates = {{"engine", 1}};
+  EXPECT_NE(std::string(AdaptedParameters(bundle, system, unknown).status().message()).find("\"engine\""), std::string::npos);
+}
+
+TEST(TrainTest, AModelOfImplicitMamlIsPulledToItsStartAtAdaptationToo) {
+  TrainingSpec spec = SmallSpec();
+  spec.algorithm = Algorithm::kImplicitMaml;
+  const auto executor = base::MakeSerialExecutor();
+  const nssm::Bundle bundle = *Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), nullptr);
+  const Trajectory system = Fleet(1, 60, 3).trajectories[0];
+  AdaptationOptions options = *DefaultAdaptation(bundle);
+  const auto distance = [&](double proximal) {
+    options.inner_loop.proximal = proximal;
+    const std::vector<double> adapted = *AdaptedParameters(bundle, system, options);
+    double squares = 0;
+    for (size_t i = 0; i < adapted.size(); ++i) squares += std::pow(adapted[i] - bundle.parameters[i], 2);
+    return std::sqrt(squares);
+  };
+  EXPECT_LT(distance(1e12), 1e-10);
+  EXPECT_LT(distance(10), distance(0.1));
+}
+
+TEST(TrainTest, ATrainingThatDivergesSaysSoAndLeavesItsLastGoodState) {
+  TrainingSpec spec = SmallSpec();
+  spec.warmup_iterations = 0;
+  spec.iterations = 200;
+  spec.outer_lr = spec.final_outer_lr = 1e3;
+  const auto executor = base::MakeSerialExecutor();
+  std::string checkpoint;
+  bool diverged = false;
+  const auto on_step = [&](const TrainingProgress& p) {
+    EXPECT_FALSE(diverged);
+    diverged = p.diverged;
+    checkpoint = WriteCheckpoint(p.state, "digest");
+    return true;
+  };
+  const absl::Status status = Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), on_step).status();
+  ASSERT_EQ(status.code(), absl::StatusCode::kOutOfRange) << status;
+  EXPECT_TRUE(diverged);
+  for (const char* part : {"diverged at iteration", "loss", "gradient norm", "last good state", "outer_lr (now 1000)"}) {
+    EXPECT_NE(std::string(status.message()).find(part), std::string::npos) << status;
+  }
+  const absl::StatusOr<TrainingState> state = ReadCheckpoint(checkpoint, "digest");
+  ASSERT_TRUE(state.ok()) << state.status();
+  for (const auto& [name, values] : state->values) {
+    EXPECT_TRUE(std::all_of(values.begin(), values.end(), [](double value) { return std::isfinite(value); })) << name;
+  }
+  // Good: a loss is still a number there, so the training goes on from it, to the same end.
+  const absl::Status again = Train(spec, Fleet(10, 80, 1), &*state, executor.get(), nullptr).status();
+  EXPECT_EQ(again, status);
 }
 
 TEST(TrainTest, ACheckpointOfAnotherTrainingIsRefused) {

@@ -19,6 +19,10 @@ void FillAll(Message* message, int* counter) {
   const auto* descriptor = message->GetDescriptor();
   for (int i = 0; i < descriptor->field_count(); ++i) {
     const FieldDescriptor* field = descriptor->field(i);
+    if (field->is_map()) {
+      FillAll(reflection->AddMessage(message, field), counter);
+      continue;
+    }
     if (field->is_repeated()) {
       reflection->AddUInt32(message, field, static_cast<uint32_t>(++*counter));
       reflection->AddUInt32(message, field, static_cast<uint32_t>(++*counter));
@@ -66,8 +70,8 @@ v1::TrainingSpec FullSpec() {
   model.mutable_output_constraint()->mutable_curl_free()->set_position_states(0, 0);
   model.mutable_output_constraint()->mutable_curl_free()->set_position_states(1, 1);
   model.set_output_size(2);  // as many as positions
-  // The others are for adaptation.
-  spec.mutable_inner_loop()->set_optimiser(v1::InnerLoopSpec::GRADIENT_DESCENT);
+  spec.mutable_inner_loop()->set_optimiser(v1::InnerLoopSpec::ADAM);  // the last is for adaptation
+  spec.set_algorithm(v1::TrainingSpec::FIRST_ORDER_MAML);             // the last learns no rates
   model.set_start(v1::ModelSpec::ENCODED);  // FITTED is Case I's
   // Read as the whole set, which has no number.
   spec.mutable_loss()->clear_horizon();

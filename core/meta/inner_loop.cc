@@ -1,0 +1,173 @@
+#include "core/meta/inner_loop.h"
+
+#include <algorithm>
+
+#include "absl/strings/str_cat.h"
+#include "core/meta/adam.h"
+
+namespace metaekf::meta {
+namespace {
+
+/// One element of a step of Adam backwards, with every adjoint negated as PullBack subtracts them.
+/// @param to_direction  −d̄. @param m_adjoint, v_adjoint  −m̄ and −v̄ as the later steps have left them. @return −ḡ.
+template <typename T>
+double PullBackAdam(double to_direction, double g, double m, double v, const AdamCorrections& corrections, T* m_adjoint,
+                    T* v_adjoint, double* direction) {
+  const double m_hat = m / corrections.first, root = std::sqrt(v / corrections.second), scale = root + kAdamEpsilon;
+  *direction = m_hat / scale;
+  const double to_m = *m_adjoint + to_direction / (corrections.first * scale);
+  double to_v = *v_adjoint;
+  if (root > 0) to_v -= to_direction * m_hat / (2 * corrections.second * root * scale * scale);
+  *m_adjoint = static_cast<T>(kAdamBeta1 * to_m);
+  *v_adjoint = static_cast<T>(kAdamBeta2 * to_v);
+  return (1 - kAdamBeta1) * to_m + 2 * (1 - kAdamBeta2) * g * to_v;
+}
+
+}  // namespace
+
+Pieces PiecesOf(const nn::ParameterLayout& layout, const nn::Mask& mask, bool flag) {
+  Pieces pieces;
+  for (size_t i = 0; i < mask.size(); ++i) {
+    const nn::Tensor& tensor = layout.tensors()[i];
+    if (mask[i] == flag) pieces.push_back({tensor.offset, tensor.size()});
+  }
+  return pieces;
+}
+
+std::vector<double> RatesOfTensors(const InnerLoopSpec& spec, const nn::ParameterLayout& layout) {
+  std::vector<double> rates;
+  for (const nn::Tensor& tensor : layout.tensors()) {
+    const auto own = spec.tensor_rates.find(tensor.name);
+    rates.push_back(own == spec.tensor_rates.end() ? spec.learning_rate : own->second);
+  }
+  return rates;
+}
+
+absl::Status CheckTensorRates(const InnerLoopSpec& spec, const nn::ParameterLayout& layout) {
+  for (const auto& [name, rate] : spec.tensor_rates) {
+    const auto& tensors = layout.tensors();
+    if (std::any_of(tensors.begin(), tensors.end(), [&](const nn::Tensor& tensor) { return tensor.name == name; })) continue;
+    return absl::InvalidArgumentError(absl::StrCat("tensor_rates: the model has no tensor \"", name, "\""));
+  }
+  return absl::OkStatus();
+}
+
+template <typename T>
+InnerLoop<T>::InnerLoop(const nn::ParameterLayout& layout, const nn::Mask& adapted, Optimiser optimiser, int32_t steps,
+                        double pull, InnerRecord record)
+    : size_(layout.size()),
+      adapted_(PiecesOf(layout, adapted, true)),
+      frozen_(PiecesOf(layout, adapted, false)),
+      optimiser_(optimiser),
+      steps_(steps),
+      pull_(pull),
+      record_(record) {}
+
+template <typename T>
+InnerLoop<T>::Trace::Trace(const InnerLoop& owner, bool rates_are_learned) : size_(owner.size_) {
+  const size_t size = static_cast<size_t>(owner.size_), steps = static_cast<size_t>(owner.steps_);
+  const bool adam = owner.optimiser_ == Optimiser::kAdam, all = owner.record_ == InnerRecord::kSteps;
+  iterates_.resize(all ? (steps + 1) * size : size);
+  gradients_.resize(all && (adam || rates_are_learned) ? steps * size : size);
+  if (adam) first_.resize(all ? steps * size : size);
+  second_.resize(first_.size());
+  if (owner.record_ == InnerRecord::kTotal) total_.resize(size);
+  if (!all) return;
+  direction_.resize(size);
+  product_.resize(size);
+  if (adam) first_adjoint_.resize(size);
+  second_adjoint_.resize(first_adjoint_.size());
+}
+
+template <typename T>
+T* InnerLoop<T>::Trace::At(std::vector<T>& vectors, int32_t index) const {
+  const size_t offset = static_cast<size_t>(index) * static_cast<size_t>(size_);
+  return vectors.data() + (offset < vectors.size() ? offset : 0);  // the only one there is
+}
+
+template <typename T>
+const T* InnerLoop<T>::Run(const T* start, const std::vector<double>& rates, Gradient gradient, Trace* trace) const {
+  std::copy_n(start, size_, trace->iterates_.data());
+  std::fill(trace->total_.begin(), trace->total_.end(), T(0));
+  for (int32_t m = 1; m <= steps_; ++m) {
+    const T* current = trace->At(trace->iterates_, m - 1);
+    gradient(current, trace->At(trace->gradients_, m - 1));
+    T* next = trace->At(trace->iterates_, m);
+    if (next != current) std::copy_n(current, size_, next);
+    Step(m, start, rates, next, trace);
+  }
+  return trace->At(trace->iterates_, steps_);
+}
+
+template <typename T>
+void InnerLoop<T>::Step(int32_t m, const T* start, const std::vector<double>& rates, T* iterate, Trace* trace) const {
+  const bool adam = optimiser_ == Optimiser::kAdam, sums = !trace->total_.empty();
+  const AdamCorrections corrections(m);
+  const T* gradient = trace->At(trace->gradients_, m - 1);
+  T* first = trace->At(trace->first_, m - 1);
+  T* second = trace->At(trace->second_, m - 1);
+  const T* last_first = m > 1 ? trace->At(trace->first_, m - 2) : nullptr;
+  const T* last_second = m > 1 ? trace->At(trace->second_, m - 2) : nullptr;
+  for (size_t l = 0; l < adapted_.size(); ++l) {
+    const T rate = static_cast<T>(rates[l]), shrink = static_cast<T>(1 / (1 + rates[l] * pull_));
+    for (int64_t i = adapted_[l].first; i < adapted_[l].first + adapted_[l].second; ++i) {
+      T direction = gradient[i];
+      if (adam) {
+        double m1 = last_first ? last_first[i] : T(0), m2 = last_second ? last_second[i] : T(0);
+        const double pulled = gradient[i] + pull_ * (iterate[i] - start[i]);
+        direction = static_cast<T>(AdamDirection(pulled, corrections, &m1, &m2));
+        first[i] = static_cast<T>(m1);
+        second[i] = static_cast<T>(m2);
+      }
+      if (sums) trace->total_[static_cast<size_t>(i)] += direction;
+      iterate[i] -= rate * direction;
+      if (!adam && pull_ > 0) iterate[i] = start[i] + shrink * (iterate[i] - start[i]);
+    }
+  }
+  if (!sums) return;
+  for (const auto& [offset, size] : frozen_) {
+    for (int64_t i = offset; i < offset + size; ++i) trace->total_[static_cast<size_t>(i)] += gradient[i];
+  }
+}
+
+template <typename T>
+void InnerLoop<T>::StepAdjoint(int32_t m, const std::vector<double>& rates, const T* adjoint, Trace* trace,
+                               double* rate_adjoint) const {
+  const AdamCorrections corrections(m);
+  const T* gradient = trace->At(trace->gradients_, m - 1);
+  const T* first = trace->At(trace->first_, m - 1);
+  const T* second = trace->At(trace->second_, m - 1);
+  for (size_t l = 0; l < adapted_.size(); ++l) {
+    double by_rate = 0;
+    for (int64_t i = adapted_[l].first; i < adapted_[l].first + adapted_[l].second; ++i) {
+      const size_t k = static_cast<size_t>(i);
+      double to_gradient = rates[l] * static_cast<double>(adjoint[i]);
+      double direction = gradient[i];
+      if (optimiser_ == Optimiser::kAdam) {
+        to_gradient = PullBackAdam(to_gradient, gradient[i], first[i], second[i], corrections, &trace->first_adjoint_[k],
+                                   &trace->second_adjoint_[k], &direction);
+      }
+      trace->direction_[k] = static_cast<T>(to_gradient);
+      by_rate += static_cast<double>(adjoint[i]) * direction;
+    }
+    if (rate_adjoint) rate_adjoint[l] -= by_rate;
+  }
+}
+
+template <typename T>
+void InnerLoop<T>::PullBack(const std::vector<double>& rates, HessianVector hessian_vector, Trace* trace, T* adjoint,
+                            double* rate_adjoint) const {
+  for (auto* vector : {&trace->direction_, &trace->first_adjoint_, &trace->second_adjoint_}) {
+    std::fill(vector->begin(), vector->end(), T(0));
+  }
+  for (int32_t m = steps_; m >= 1; --m) {
+    StepAdjoint(m, rates, adjoint, trace, rate_adjoint);
+    hessian_vector(trace->At(trace->iterates_, m - 1), trace->direction_.data(), trace->product_.data());
+    for (int64_t i = 0; i < size_; ++i) adjoint[i] -= trace->product_[static_cast<size_t>(i)];
+  }
+}
+
+template class InnerLoop<float>;
+template class InnerLoop<double>;
+
+}  // namespace metaekf::meta

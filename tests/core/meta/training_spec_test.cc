@@ -1,0 +1,59 @@
+#include "core/meta/training_spec.h"
+
+#include <gtest/gtest.h>
+
+namespace metaekf::meta {
+namespace {
+
+using nlohmann::json;
+
+json WithModel(json spec) {
+  spec["model"] = {{"case", "INPUT_OUTPUT"}, {"latent_size", 2}};
+  return spec;
+}
+
+std::string ErrorOf(const json& spec) { return std::string(ReadTrainingSpec(WithModel(spec)).status().message()); }
+
+TEST(TrainingSpecTest, EveryAlgorithmIsReadAndWritten) {
+  for (const char* name : {"MAML", "FIRST_ORDER_MAML", "SUPERVISED", "GAUSSIAN_PRIOR", "REPTILE", "IMPLICIT_MAML"}) {
+    const auto spec = ReadTrainingSpec(WithModel({{"algorithm", name}}));
+    ASSERT_TRUE(spec.ok()) << spec.status();
+    EXPECT_EQ(ToJson(*spec)["algorithm"], name);
+  }
+}
+
+TEST(TrainingSpecTest, WhatIsWrittenReadsBack) {
+  const json spec = WithModel({{"inner_loop",
+                                {{"learned_rates", true}, {"optimiser", "ADAM"}, {"tensor_rates", {{"encoder.0.weight", 0.5}}}}},
+                               {"implicit_maml", {{"cg_steps", 7}, {"cg_tolerance", 0.125}}}});
+  const auto read = ReadTrainingSpec(spec);
+  ASSERT_TRUE(read.ok()) << read.status();
+  EXPECT_TRUE(read->inner_loop.learned_rates);
+  EXPECT_TRUE(read->adaptation.learned_rates);
+  EXPECT_EQ(read->inner_loop.tensor_rates.at("encoder.0.weight"), 0.5);
+  EXPECT_EQ(read->implicit_maml.cg_steps, 7);
+  EXPECT_EQ(ToJson(*ReadTrainingSpec(ToJson(*read))), ToJson(*read));
+}
+
+TEST(TrainingSpecTest, AdaptationTakesItsRatesFromTheInnerLoopUnlessItHasItsOwn) {
+  const json inner = {{"learned_rates", true}, {"tensor_rates", {{"a", 1}}}};
+  const auto own = ReadTrainingSpec(WithModel({{"inner_loop", inner}, {"adaptation", {{"tensor_rates", {{"b", 2}}}}}}));
+  EXPECT_EQ(own->adaptation.tensor_rates, (std::map<std::string, double>{{"b", 2}}));
+  // The rates of one optimiser are nothing to another.
+  const auto other = ReadTrainingSpec(WithModel({{"inner_loop", inner}, {"adaptation", {{"optimiser", "ADAM"}}}}));
+  EXPECT_TRUE(other->adaptation.tensor_rates.empty());
+  EXPECT_FALSE(other->adaptation.learned_rates);
+}
+
+TEST(TrainingSpecTest, WhatAnAlgorithmCannotUseIsRefusedByName) {
+  EXPECT_EQ(ErrorOf({{"algorithm", "REPTILE"}, {"inner_loop", {{"learned_rates", true}}}}).rfind("inner_loop.learned_rates: ", 0), 0u);
+  EXPECT_EQ(ErrorOf({{"algorithm", "REPTILE"}, {"inner_loop", {{"steps", 0}}}}).rfind("inner_loop.steps: ", 0), 0u);
+  EXPECT_EQ(ErrorOf({{"algorithm", "IMPLICIT_MAML"}, {"inner_loop", {{"proximal", 0}}}}).rfind("inner_loop.proximal: ", 0), 0u);
+  EXPECT_EQ(ErrorOf({{"inner_loop", {{"optimiser", "LEVENBERG_MARQUARDT"}}}}).rfind("inner_loop.optimiser: ", 0), 0u);
+  EXPECT_EQ(ErrorOf({{"inner_loop", {{"learned_rates", true}, {"learning_rate", 0}}}}).rfind("inner_loop.learning_rate: ", 0), 0u);
+  EXPECT_EQ(ErrorOf({{"inner_loop", {{"tensor_rates", {{"a", -1}}}}}}).rfind("inner_loop.tensor_rates.a: ", 0), 0u);
+  EXPECT_EQ(ErrorOf({{"implicit_maml", {{"cg_tolerance", 2}}}}).rfind("implicit_maml.cg_tolerance: ", 0), 0u);
+}
+
+}  // namespace
+}  // namespace metaekf::meta
