@@ -13,16 +13,18 @@ namespace metaekf::meta {
 ///
 ///   ∇ₐL(𝓒; φ, f) + λ (φ − a₀) = 0     gives     dφ/da₀ = (I + Hₐₐ/λ)⁻¹,   dφ/df = −(I + Hₐₐ/λ)⁻¹ Hₐf / λ,
 ///
-/// H the Hessian of L(𝓒) at (φ, f). So a function with gradient t = (tₐ, t_f) there has, as a function of (a₀, f), the gradient
+/// H the Hessian of L(𝓒) at (φ, f). So a function with gradient t = (tₐ, t_f) there has, as a function of (a₀, f), the
+/// gradient
 ///
 ///   z = (I + Hₐₐ/λ)⁻¹ tₐ   in a₀,      t_f − H_fa z / λ   in f.
 ///
-/// z comes from conjugate gradients, one Hessian–vector product a step, from z = 0. Where the loss is not convex I + Hₐₐ/λ may
-/// be indefinite or nearly singular, and short of a minimum that says nothing: the first direction d with
+/// z comes from conjugate gradients, one Hessian–vector product a step, from z = 0. Where the loss is not convex
+/// I + Hₐₐ/λ may be indefinite or nearly singular, and short of a minimum that says nothing: the first direction d with
 /// dᵀ(I + Hₐₐ/λ)d ≤ 0.1 dᵀd ends the iteration with what there is, and if it is the first of all with z = tₐ, the
 /// first-order gradient. λ → ∞ gives t.
 ///
-/// Source: A. Rajeswaran, C. Finn, S. Kakade, S. Levine, Meta-Learning with Implicit Gradients, 2019, for z; the part of f is ours.
+/// Source: A. Rajeswaran, C. Finn, S. Kakade, S. Levine, Meta-Learning with Implicit Gradients, 2019, for z; the part
+/// of f is ours.
 template <typename T>
 class ImplicitGradient {
  public:

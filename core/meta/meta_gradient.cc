@@ -68,7 +68,8 @@ size_t MetaGradient<T>::variables() const {
 template <typename T>
 void MetaGradient<T>::ReadRates(const T* variables, Scratch* scratch) const {
   if (!learned_rates_) return;
-  for (size_t l = 0; l < rates_.size(); ++l) scratch->rates_[l] = std::exp(static_cast<double>(variables[static_cast<size_t>(size_) + l]));
+  const T* logarithms = variables + size_;
+  for (size_t l = 0; l < rates_.size(); ++l) scratch->rates_[l] = std::exp(static_cast<double>(logarithms[l]));
 }
 
 template <typename T>

@@ -14,7 +14,8 @@ namespace metaekf::meta {
 ///   MAML               g = ∇L(𝓣; ω_M), pulled back through the M steps with Hessian–vector products: exact
 ///   FIRST_ORDER_MAML   g = ∇L(𝓣; ω_M)
 ///   SUPERVISED         g = ∇L(𝓣; ω_0)
-///   IMPLICIT_MAML      g = the gradient of L(𝓣) at the minimum of L(𝓒; ω) + ½ λ |ω − ω₀|², taken to be ω_M (ImplicitGradient)
+///   IMPLICIT_MAML      g = the gradient of L(𝓣) at the minimum of L(𝓒; ω) + ½ λ |ω − ω₀|², which ω_M is taken for
+///                          (ImplicitGradient)
 ///   REPTILE            g = d_1 + … + d_M of an inner loop on 𝓒 ∪ 𝓣 = (ω₀ − ω_M)/β;  of parameters that do not adapt the
 ///                          sum of their gradients ∇L(𝓒 ∪ 𝓣; ω_{m−1}) on the way
 ///

@@ -125,13 +125,14 @@ constexpr char kParameters[] = "parameters", kFirstMoment[] = "first_moment", kS
                kBest[] = "best_parameters", kFirstLoss[] = "first_loss";
 
 absl::Status Diverged(const TrainingSpec& spec, int32_t iteration, double loss, double norm, const TrainingState& good) {
-  const std::string best = std::isfinite(good.best_validation_loss)
-                               ? absl::StrCat(" and the best so far (validation loss ", base::FormatShort(good.best_validation_loss), ")")
-                               : "";
+  std::string best;
+  if (std::isfinite(good.best_validation_loss)) {
+    best = absl::StrCat(" and the best so far, of validation loss ", base::FormatShort(good.best_validation_loss));
+  }
   return absl::OutOfRangeError(absl::StrCat(
       "the training diverged at iteration ", iteration, ": loss ", base::FormatShort(loss), ", gradient norm ",
-      base::FormatShort(norm), "; the last good state is that after iteration ", good.iteration, ", its checkpoint holds it", best,
-      "; a smaller outer_lr (now ", base::FormatShort(spec.outer_lr), "), inner_loop.learning_rate (now ",
+      base::FormatShort(norm), "; the last checkpoint holds the last good state, that after iteration ", good.iteration,
+      best, "; a smaller outer_lr (now ", base::FormatShort(spec.outer_lr), "), inner_loop.learning_rate (now ",
       base::FormatShort(spec.inner_loop.learning_rate), ") or clip_norm may help"));
 }
 
@@ -169,7 +170,9 @@ class OuterLoop {
       const bool validate = !systems_.validation.empty() && (state_->iteration % spec_.validation_period == 0 ||
                                                              state_->iteration == spec_.iterations);
       if (validate) Validate();
-      if (on_step && !on_step({*state_, spec_.iterations, validate})) return absl::CancelledError("the training was cancelled");
+      if (on_step && !on_step({*state_, spec_.iterations, validate})) {
+        return absl::CancelledError("the training was cancelled");
+      }
     }
     return absl::OkStatus();
   }
@@ -189,7 +192,8 @@ class OuterLoop {
     const double norm = ClipNorm(spec_.clip_norm, &gradient_);
     const int32_t step = state_->iteration + 1 - (warming_up ? 0 : spec_.warmup_iterations);
     const double first_loss = step == 1 ? loss : state_->values[kFirstLoss].front();
-    const double mean_loss = step == 1 ? loss : state_->training_loss + kTrainingLossWeight * (loss - state_->training_loss);
+    const double last = step == 1 ? loss : state_->training_loss;
+    const double mean_loss = last + kTrainingLossWeight * (loss - last);
     if (!std::isfinite(loss) || !std::isfinite(norm) || mean_loss > kHopeless * std::max(1.0, first_loss)) {
       const int32_t iteration = state_->iteration + 1;
       if (good_) *state_ = *std::move(good_);

@@ -6,6 +6,7 @@
 #include "absl/strings/str_cat.h"
 #include "core/base/numbers.h"
 #include "core/base/status.h"
+#include "core/meta/inner_loop.h"
 #include "server/convert/json.h"
 #include "server/convert/spec.h"
 #include "server/convert/time.h"
@@ -59,6 +60,20 @@ v1::HeldOutErrors::Rmse ToMessage(const meta::TailErrors& errors) {
   return rmse;
 }
 
+/// Rates of the request instead of the learned ones, which it may also decline.
+absl::Status TakeTensorRates(const v1::InnerLoopSpec& request, const std::string& field,
+                             const nssm::Bundle& bundle, meta::InnerLoopSpec* inner_loop) {
+  if (request.has_learned_rates() && !request.learned_rates()) inner_loop->tensor_rates.clear();
+  for (const auto& [name, rate] : request.tensor_rates()) {
+    if (!std::isfinite(rate) || rate <= 0) {
+      return FieldViolation(absl::StrCat(field, ".tensor_rates.", name),
+                            absl::StrCat("is ", base::FormatExact(rate), ", must be positive"));
+    }
+    inner_loop->tensor_rates[name] = rate;
+  }
+  return InField(field, meta::CheckTensorRates(*inner_loop, bundle.model.layout()));
+}
+
 }  // namespace
 
 absl::StatusOr<meta::AdaptationOptions> ResolveOptions(const v1::AdaptRequest::Options& request,
@@ -94,6 +109,7 @@ absl::StatusOr<meta::AdaptationOptions> ResolveOptions(const v1::AdaptRequest::O
         InField(absl::StrCat(field, ".adapted_mask"),
                 nn::ParseMask(options.inner_loop.adapted_mask, bundle.model.layout()).status()));
   }
+  METAEKF_RETURN_IF_ERROR(TakeTensorRates(inner_loop, field, bundle, &options.inner_loop));
   return options;
 }
 
@@ -104,6 +120,8 @@ std::string AdaptationReceipt(const meta::AdaptationOptions& options,
   message.mutable_inner_loop()->set_steps(static_cast<uint32_t>(options.inner_loop.steps));
   message.mutable_inner_loop()->set_learning_rate(options.inner_loop.learning_rate);
   message.mutable_inner_loop()->set_adapted_mask(options.inner_loop.adapted_mask);
+  message.mutable_inner_loop()->mutable_tensor_rates()->insert(
+      options.inner_loop.tensor_rates.begin(), options.inner_loop.tensor_rates.end());
   message.set_seed(options.seed);
   message.set_context_samples(static_cast<uint32_t>(result.context_samples));
   message.set_context_loss_before(result.context_loss_before);

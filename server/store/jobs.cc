@@ -261,8 +261,10 @@ absl::StatusOr<std::string> JobStore::WorkDirectory(int64_t number) {
 }
 
 void JobStore::CleanUp(const Job& job) {
-  std::error_code ignored;  // the next start tries again
-  std::filesystem::remove_all(absl::StrCat(context_.jobs_directory, "/", job.number), ignored);
+  if (job.state != JobState::kFailed) {
+    std::error_code ignored;  // the next start tries again
+    std::filesystem::remove_all(absl::StrCat(context_.jobs_directory, "/", job.number), ignored);
+  }
   RemoveIfUnreferenced(context_, job.dataset_digest);
 }
 

@@ -87,7 +87,8 @@ class JobStore {
   /// Errors: FailedPrecondition if it has succeeded or failed.
   absl::StatusOr<Job> Cancel(int64_t number);
 
-  /// A directory of the job's own, for checkpoints; it is there until the job has ended.
+  /// A directory of the job's own, for checkpoints; it is there until the job has ended, and stays
+  /// if the job has failed.
   absl::StatusOr<std::string> WorkDirectory(int64_t number);
 
  private:

@@ -118,13 +118,14 @@ absl::Status Store::CollectGarbage() {
       if (!keep.contains(digest)) blobs_.Remove(digest);
     }
 
-    std::set<std::string> active_jobs;
+    // Failed ones keep their last checkpoint.
+    std::set<std::string> keep_directory;
     METAEKF_RETURN_IF_ERROR(
-        connection.Execute("SELECT number FROM jobs WHERE state IN ('QUEUED', 'RUNNING')", {},
-                           [&](const Row& row) { active_jobs.insert(row.Text(0)); }));
+        connection.Execute("SELECT number FROM jobs WHERE state IN ('QUEUED', 'RUNNING', 'FAILED')",
+                           {}, [&](const Row& row) { keep_directory.insert(row.Text(0)); }));
     METAEKF_ASSIGN_OR_RETURN(const auto directories, ListDirectory(context_.jobs_directory));
     for (const std::string& number : directories) {
-      if (active_jobs.contains(number)) continue;
+      if (keep_directory.contains(number)) continue;
       std::error_code ignored;  // the next start tries again
       std::filesystem::remove_all(absl::StrCat(context_.jobs_directory, "/", number), ignored);
     }

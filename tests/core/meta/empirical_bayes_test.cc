@@ -4,14 +4,18 @@
 
 #include <Eigen/Eigenvalues>
 #include <Eigen/Geometry>
+#include <Eigen/LU>
+#include <algorithm>
 #include <cmath>
 
 #include "core/base/rng.h"
 #include "core/meta/adapt.h"
 #include "core/meta/arx.h"
+#include "core/meta/fit_plan.h"
 #include "core/meta/train.h"
 #include "core/nssm/model_file.h"
 #include "core/nssm/predict.h"
+#include "tests/core/nssm/random_models.h"
 
 namespace metaekf::meta {
 namespace {
@@ -104,6 +108,69 @@ TEST(EmpiricalBayesTest, AFewSamplesOfANewSystemAreEnoughToSimulateIt) {
     EXPECT_GT(eigenvalues.minCoeff(), -1e-9 * eigenvalues.maxCoeff());
   }
   EXPECT_LT(adapted_errors, 0.1 * unadapted_errors);
+}
+
+/// ŷ = Φθ with Φ of a fixed linear encoder and transition: only the output decoder θ differs from system to system.
+TrainingSpec LinearFamily() {
+  TrainingSpec spec;
+  spec.model = {.kind = nssm::Case::kInputOutput, .input_size = 1, .output_size = 1, .state_size = 0};
+  spec.model.latent_size = spec.model.window = 2;
+  spec.model.precision = nssm::Precision::kFloat64;
+  spec.loss = {.horizon = 1, .rollout = nssm::RolloutMode::kLatent, .state_weight = 0, .reconstruction_weight = 0};
+  spec.algorithm = Algorithm::kGaussianPrior;
+  spec.gaussian_prior = {.initial_std = 0.5, .rounds = 0, .restarts = 2, .first_steps = 60};
+  return spec;
+}
+
+// Of a linear family with Gaussian noise both steps are linear algebra, written out here. The fits end when a step brings
+// less than 1e-5 of the cost, so they are a per mille off.
+TEST(EmpiricalBayesTest, OneRoundOnALinearFamilyIsItsClosedForm) {
+  const TrainingSpec spec = LinearFamily();
+  const nssm::Model model = *nssm::Model::Create(spec.model);
+  const nn::Mask mask = *nn::ParseMask("output_decoder", model.layout());
+  Systems systems;
+  for (uint64_t seed = 0; seed < 7; ++seed) systems.training.push_back(nssm::RandomTrajectory(spec.model, 60, 20 + seed));
+  const auto executor = base::MakeSerialExecutor();
+  TrainingState state;
+  const absl::StatusOr<LearnedPrior> learned = LearnGaussianPrior(spec, model, mask, systems, executor.get(), &state, nullptr);
+  ASSERT_TRUE(learned.ok()) << learned.status();
+
+  const FitPlan plan(model, spec.loss, mask);
+  const nssm::RolloutLeastSquares& problem = plan.dynamics;
+  const SystemFit first = *FitFromScratch(plan, model, spec.loss, systems.training[0],
+                                          {.seed = spec.seed, .restarts = 2, .steps = 60}, nullptr);
+  const Index p = problem.unknowns();
+  const VectorXd m = first.fit.unknowns;
+  const MatrixXd precision = MatrixXd::Identity(p, p) / 0.25;
+  const double variance = first.fit.noise_variance[0];
+  std::vector<VectorXd> fits;
+  VectorXd mean = VectorXd::Zero(p);
+  MatrixXd covariance = MatrixXd::Zero(p, p);
+  std::vector<double> variances;
+  for (const Trajectory& system : systems.training) {
+    const nssm::LossData<double> data = *problem.Cut(system);
+    nssm::RolloutLeastSquares::Workspace workspace(problem, data.shape);
+    const auto predictions = [&](const VectorXd& theta) -> VectorXd {
+      std::vector<double> parameters = model.InitialParameters(spec.seed);
+      ScatterAdapted(problem, theta, &parameters);
+      return problem.Predictions(parameters.data(), VectorXd(), data, &workspace).reshaped();
+    };
+    MatrixXd phi(data.outputs.size(), p);
+    for (Index i = 0; i < p; ++i) phi.col(i) = predictions(VectorXd::Unit(p, i)) - predictions(VectorXd::Zero(p));
+    const VectorXd y = Eigen::Map<const VectorXd>(data.outputs.data(), phi.rows());
+    const MatrixXd posterior = (precision + phi.transpose() * phi / variance).inverse();
+    fits.push_back(posterior * (precision * m + phi.transpose() * y / variance));
+    mean += fits.back() / 7;
+    covariance += posterior / 7;
+    const double determined = static_cast<double>(p) - (posterior * precision).trace();
+    variances.push_back((phi * fits.back() - y).squaredNorm() / (static_cast<double>(phi.rows()) - determined));
+  }
+  for (const VectorXd& fit : fits) covariance += (fit - mean) * (fit - mean).transpose() / 7;
+  std::sort(variances.begin(), variances.end());
+
+  EXPECT_LT((GatherAdapted(problem, learned->parameters) - mean).norm(), 5e-3 * mean.norm());
+  EXPECT_LT((learned->prior.dynamics.inverse() - covariance).norm(), 5e-3 * covariance.norm());
+  EXPECT_NEAR(learned->prior.noise_variance[0], variances[3], 1e-3 * variances[3]);
 }
 
 TEST(EmpiricalBayesTest, TheNoiseOfTheFleetIsFoundOut) {

@@ -36,7 +36,9 @@ struct Quadratic {
 class KnownAnswersTest : public ::testing::Test {
  protected:
   static ModelSpec Linear() {
-    ModelSpec spec{.kind = nssm::Case::kStateInputOutput, .input_size = 1, .output_size = 1, .state_size = 2, .latent_size = 3, .window = 1};
+    ModelSpec spec{.kind = nssm::Case::kStateInputOutput, .input_size = 1, .output_size = 1, .state_size = 2};
+    spec.latent_size = 3;
+    spec.window = 1;
     spec.precision = nssm::Precision::kFloat64;
     return spec;
   }

@@ -128,15 +128,14 @@ TEST(MetaGradientTest, LearnedRatesMatchCentralDifferences) {
 // With an inner loop that has come to rest the differences are those of the minimum itself.
 TEST(MetaGradientTest, TheImplicitGradientMatchesCentralDifferencesOfTheMinimum) {
   double worst = 0;
-  for (const ModelCase& c : {nssm::ModelCases()[0], nssm::ModelCases()[5]}) {
-    for (const char* mask : {"*", "encoder.0,transition"}) {
-      TrainingSpec spec = Spec(c, Algorithm::kImplicitMaml, 200, 0.1);  // each step shortens the rest by 1 + βλ
-      spec.inner_loop.proximal = 2;
-      spec.implicit_maml = {.cg_steps = 300, .cg_tolerance = 1e-13};
-      const double error = RelativeErrorAgainstDifferences(c, mask, spec, 1e-3);
-      EXPECT_LT(error, 1e-6) << c.name << ", mask " << mask;
-      worst = std::max(worst, error);
-    }
+  for (const auto& [index, mask] : {std::pair{0, "encoder.0,transition"}, {5, "*"}}) {
+    const ModelCase c = nssm::ModelCases()[static_cast<size_t>(index)];
+    TrainingSpec spec = Spec(c, Algorithm::kImplicitMaml, 300, 0.2);
+    spec.inner_loop.proximal = 2;
+    spec.implicit_maml = {.cg_steps = 300, .cg_tolerance = 1e-13};
+    const double error = RelativeErrorAgainstDifferences(c, mask, spec, 1e-3);
+    EXPECT_LT(error, 1e-6) << c.name << ", mask " << mask;
+    worst = std::max(worst, error);
   }
   RecordProperty("worst", base::FormatShort(worst));
 }

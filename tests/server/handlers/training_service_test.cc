@@ -8,6 +8,7 @@
 namespace metaekf::server {
 namespace {
 
+using ::testing::ElementsAre;
 using ::testing::HasSubstr;
 using ::testing::SizeIs;
 
@@ -52,8 +53,13 @@ TEST_F(TrainingServiceTest, ATrainingThatFailsSaysWhy) {
   const auto watched = client_->Watch("jobs/1");
   ASSERT_TRUE(watched.ok()) << watched;
   EXPECT_EQ(watched.value.back().state(), v1::Job::FAILED);
-  EXPECT_THAT(watched.value.back().error_message(), HasSubstr("diverged"));
+  EXPECT_THAT(watched.value.back().error_message(), HasSubstr("diverged at iteration 1: loss"));
   EXPECT_EQ(watched.value.back().model_version(), "");
+  // The last good state stays, also over a restart.
+  EXPECT_THAT(*store::ListDirectory(directory_.path() + "/jobs/1"), ElementsAre("checkpoint"));
+  Stop();
+  Start();
+  EXPECT_THAT(*store::ListDirectory(directory_.path() + "/jobs/1"), ElementsAre("checkpoint"));
 }
 
 TEST_F(TrainingServiceTest, ACancelledJobStopsForGood) {

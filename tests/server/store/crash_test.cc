@@ -166,7 +166,7 @@ void CheckFiles(Store& store, const std::string& directory) {
   EXPECT_THAT(store.TakeInventory(true)->problems, IsEmpty());
   EXPECT_THAT(*ListDirectory(directory + "/tmp"), IsEmpty());
   std::set<std::string> expected;
-  std::set<std::string> active_jobs;
+  std::set<std::string> with_directory;
   for (const char* model : {"m0", "m1", "m2", "trained"}) {
     for (const auto& version : AllVersions(store, model)) {
       EXPECT_TRUE(store.models().ReadFile(version).ok());
@@ -177,12 +177,12 @@ void CheckFiles(Store& store, const std::string& directory) {
   for (const auto& adaptation : adaptations.items) expected.insert(adaptation.digest);
   const auto jobs = store.jobs().List({1000, ""}).value();
   for (const auto& job : jobs.items) {
-    if (job.state != JobState::kQueued && job.state != JobState::kRunning) continue;
-    expected.insert(job.dataset_digest);
-    active_jobs.insert(absl::StrCat(job.number));
+    const bool active = job.state == JobState::kQueued || job.state == JobState::kRunning;
+    if (active) expected.insert(job.dataset_digest);
+    if (active || job.state == JobState::kFailed) with_directory.insert(absl::StrCat(job.number));
   }
   EXPECT_THAT(*ListDirectory(directory + "/blobs"), UnorderedElementsAreArray(expected));
-  EXPECT_THAT(*ListDirectory(directory + "/jobs"), testing::IsSubsetOf(active_jobs));
+  EXPECT_THAT(*ListDirectory(directory + "/jobs"), testing::IsSubsetOf(with_directory));
 }
 
 /// A job has succeeded if and only if there is exactly one version that says it is the job's.
