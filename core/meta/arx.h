@@ -25,6 +25,8 @@ class ArxModel {
   Eigen::MatrixXd Predict(const data::Trajectory& trajectory, bool simulate, Eigen::Index warmup) const;
 
   int order() const { return order_; }
+  /// n_y × (1 + n n_y + (n + 1) n_u): c, A_1 … A_n, B_0 … B_n.
+  const Eigen::MatrixXd& coefficients() const { return coefficients_; }
 
  private:
   Eigen::VectorXd Regressor(const Eigen::MatrixXd& inputs, const Eigen::MatrixXd& outputs, Eigen::Index t) const;
