@@ -12,7 +12,7 @@ namespace {
 constexpr size_t kMostPoints = 2000;
 
 bool Drawable(const Area& area, double x, double y) {
-  return IsShown(x, false) && IsShown(y, area.y.logarithmic);
+  return IsShown(x, area.x.logarithmic) && IsShown(y, area.y.logarithmic);
 }
 
 }  // namespace

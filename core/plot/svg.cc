@@ -37,17 +37,18 @@ absl::Status CheckLengths(const Figure& figure) {
 Axis XAxis(const Figure& figure, double width_px) {
   const int ticks = static_cast<int>(width_px / 100) + 1;
   Range range;
-  const auto add = [&range](const std::vector<double>& values) {
+  const bool logarithmic = figure.logarithmic_x;
+  const auto add = [&range, logarithmic](const std::vector<double>& values) {
     for (const double value : values) {
-      if (IsShown(value, false)) range.Add(value);
+      if (IsShown(value, logarithmic)) range.Add(value);
     }
   };
   for (const Panel& panel : figure.panels) {
     for (const Series& series : panel.series) add(series.x);
     for (const Band& band : panel.bands) add(band.x);
   }
-  if (range.empty()) return MakeAxis(0, 1, false, 0, ticks);
-  return MakeAxis(range.min, range.max, false, 0, ticks);
+  if (range.empty()) return MakeAxis(logarithmic ? 0.1 : 0, 1, logarithmic, 0, ticks);
+  return MakeAxis(range.min, range.max, logarithmic, logarithmic ? 0.02 : 0, ticks);
 }
 
 Axis YAxis(const Panel& panel) {

@@ -52,6 +52,7 @@ struct Panel {
 struct Figure {
   std::string title;
   std::string x_label;  ///< with its unit
+  bool logarithmic_x = false;
   std::vector<Panel> panels;
   double width_px = 900;
   double panel_height_px = 210;  ///< of the plot area of each

@@ -1,0 +1,105 @@
+#include "core/experiments/bouc_wen_learners.h"
+
+#include <chrono>
+
+#include "core/base/status.h"
+#include "core/meta/adapt.h"
+
+namespace metaekf::experiments {
+namespace {
+
+using nlohmann::json;
+
+/// Fits in free run over whole recordings: starts fitted, no encoder.
+constexpr char kGaussianPrior[] = R"json({
+  "algorithm": "GAUSSIAN_PRIOR",
+  "model": {
+    "case": "INPUT_OUTPUT", "latent_size": 4, "window": 40, "start": "FITTED", "precision": "FLOAT64",
+    "transition": {"form": "JOINT", "bypass": "LINEAR", "input_time": "NEXT",
+                   "block": {"hidden_widths": [12], "activation": "TANH", "output_scale": 0.1}}
+  },
+  "loss": {"whole_set_horizon": true},
+  "gaussian_prior": {"initial_std": 0.1, "first_steps": 40, "round_steps": 10, "rounds": 3},
+  "context_samples": 1000, "target_samples": 1000
+})json";
+
+/// The gradient-based learners: the same transition behind a linear encoder of 20 samples.
+constexpr char kGradientBased[] = R"json({
+  "model": {
+    "case": "INPUT_OUTPUT", "latent_size": 6, "window": 20, "precision": "FLOAT64",
+    "transition": {"form": "JOINT", "bypass": "LINEAR", "input_time": "NEXT",
+                   "block": {"hidden_widths": [16], "activation": "TANH", "output_scale": 0.1}}
+  },
+  "loss": {"horizon": 40, "stride": 20},
+  "inner_loop": {"steps": 5, "learning_rate": 1e-4},
+  "adaptation": {"steps": 300, "learning_rate": 1e-3, "optimiser": "ADAM"},
+  "context_samples": 500, "target_samples": 500, "task_batch": 4, "clip_norm": 1, "validation_period": 50,
+  "iterations": 2400, "warmup_iterations": 2000, "warmup_horizon": 20,
+  "warmup_lr": 0.01, "outer_lr": 0.001, "final_outer_lr": 1e-4
+})json";
+
+struct Variant {
+  const char* label;
+  const char* common;
+  const char* changes;
+};
+
+constexpr Variant kVariants[] = {
+    {"Gaussian prior", kGaussianPrior, "{}"},
+    {"MAML", kGradientBased, R"json({"algorithm": "MAML"})json"},
+    {"FO-MAML", kGradientBased, R"json({"algorithm": "FIRST_ORDER_MAML"})json"},
+    {"ANIL", kGradientBased, R"json({"algorithm": "MAML", "inner_loop": {"adapted_mask": "transition,output_decoder"}})json"},
+    {"Reptile", kGradientBased, R"json({"algorithm": "REPTILE"})json"},
+    {"iMAML", kGradientBased, R"json({"algorithm": "IMPLICIT_MAML"})json"},
+    {"Xfer", kGradientBased, R"json({"algorithm": "SUPERVISED"})json"},
+};
+
+/// For tests: seconds, and nothing is learned.
+constexpr char kTiny[] = R"json({
+  "iterations": 6, "warmup_iterations": 3, "context_samples": 120, "target_samples": 120,
+  "gaussian_prior": {"restarts": 1, "rounds": 1, "first_steps": 4, "round_steps": 2}
+})json";
+
+}  // namespace
+
+std::vector<Learner> BoucWenLearners(Budget budget) {
+  std::vector<Learner> learners;
+  for (const Variant& variant : kVariants) {
+    Learner learner{variant.label, TrainingData::kFleet, json::parse(variant.common)};
+    learner.specification.merge_patch(json::parse(variant.changes));
+    if (budget == Budget::kTiny) {
+      learner.specification.merge_patch(json::parse(kTiny));
+      learner.specification["adaptation"]["steps"] = 5;
+    }
+    if (CheckLearner(learner).ok()) learners.push_back(std::move(learner));
+  }
+  return learners;
+}
+
+absl::StatusOr<SystemModel> FitFromScratch(const nssm::Bundle& bundle, const data::Trajectory& context, uint64_t seed) {
+  METAEKF_ASSIGN_OR_RETURN(meta::AdaptationOptions options,
+                           meta::DefaultAdaptation(bundle, meta::AdaptationMethod::kFromScratch));
+  options.seed = seed;
+  nssm::Bundle fitted = bundle;
+  METAEKF_ASSIGN_OR_RETURN(fitted.parameters, meta::AdaptedParameters(bundle, context, options));
+  return ModelOf(fitted);
+}
+
+absl::StatusOr<std::vector<nssm::Bundle>> TrainAll(const std::vector<Learner>& learners, const data::Dataset& fleet,
+                                                   uint64_t seed, base::Executor* executor, const OnProgress& on_progress,
+                                                   std::vector<double>* seconds) {
+  using Clock = std::chrono::steady_clock;
+  std::vector<nssm::Bundle> bundles;
+  for (const Learner& learner : learners) {
+    if (on_progress && !on_progress(bundles.size(), learners.size(), "training " + learner.label)) {
+      return absl::CancelledError("the study was cancelled");
+    }
+    const Clock::time_point begin = Clock::now();
+    METAEKF_ASSIGN_OR_RETURN(nssm::Bundle bundle, TrainLearner(learner, fleet, {}, seed, executor));
+    bundles.push_back(std::move(bundle));
+    seconds->push_back(std::chrono::duration<double>(Clock::now() - begin).count());
+  }
+  return bundles;
+}
+
+}  // namespace metaekf::experiments

@@ -1,0 +1,38 @@
+#include "core/experiments/jobs.h"
+
+#include <time.h>
+
+#include <atomic>
+#include <mutex>
+#include <vector>
+
+namespace metaekf::experiments {
+
+double ThreadSeconds() {
+  timespec now{};
+  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &now);
+  return static_cast<double>(now.tv_sec) + 1e-9 * static_cast<double>(now.tv_nsec);
+}
+
+absl::Status RunJobs(size_t count, base::Executor* executor, const std::string& what, const OnProgress& on_progress,
+                     const std::function<absl::Status(size_t index)>& job) {
+  std::vector<absl::Status> statuses(count);
+  std::atomic<bool> stop = false;
+  std::mutex telling;
+  size_t done = 0;
+  bool cancelled = false;
+  executor->ParallelFor(count, [&](size_t index, size_t) {
+    if (stop) return;
+    statuses[index] = job(index);
+    const std::lock_guard<std::mutex> lock(telling);
+    ++done;
+    if (on_progress && !on_progress(done, count, what)) cancelled = true;
+    if (cancelled || !statuses[index].ok()) stop = true;
+  });
+  for (const absl::Status& status : statuses) {
+    if (!status.ok()) return status;
+  }
+  return cancelled ? absl::CancelledError("the study was cancelled") : absl::OkStatus();
+}
+
+}  // namespace metaekf::experiments

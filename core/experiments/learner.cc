@@ -1,0 +1,103 @@
+#include "core/experiments/learner.h"
+
+#include <algorithm>
+#include <memory>
+#include <utility>
+
+#include "core/base/status.h"
+#include "core/data/split.h"
+#include "core/meta/adapt.h"
+#include "core/meta/train.h"
+
+namespace metaekf::experiments {
+namespace {
+
+using data::Trajectory;
+using Eigen::MatrixXd;
+
+const char* NameOf(TrainingData data) {
+  switch (data) {
+    case TrainingData::kFleet:
+      return "fleet";
+    case TrainingData::kFleetAndContext:
+      return "fleet and context";
+    case TrainingData::kContext:
+      return "context";
+  }
+  return "";
+}
+
+absl::Status CheckWarmup(const SystemModel& model, int64_t from) {
+  if (from >= model.warmup) return absl::OkStatus();
+  return absl::FailedPreconditionError(
+      absl::StrCat("predictions from sample ", from, " on need a warm-up of ", model.warmup, " samples"));
+}
+
+absl::StatusOr<Trajectory> Cut(const Trajectory& recording, int64_t first, int64_t count) {
+  METAEKF_ASSIGN_OR_RETURN(const Trajectory rest, data::SamplesFrom(recording, first));
+  return data::FirstSamples(rest, std::min<int64_t>(count, rest.length()));
+}
+
+}  // namespace
+
+nlohmann::json ToJson(const Learner& learner) {
+  return {{"label", learner.label}, {"trained_on", NameOf(learner.data)}, {"specification", learner.specification}};
+}
+
+absl::Status CheckLearner(const Learner& learner) {
+  return base::Annotate(meta::ReadTrainingSpec(learner.specification).status(), learner.label);
+}
+
+absl::StatusOr<nssm::Bundle> TrainLearner(const Learner& learner, const data::Dataset& fleet, const Trajectory& context,
+                                          uint64_t seed, base::Executor* executor) {
+  nlohmann::json specification = learner.specification;
+  specification["seed"] = seed;
+  METAEKF_ASSIGN_OR_RETURN(const meta::TrainingSpec spec, meta::ReadTrainingSpec(specification));
+  data::Dataset data = fleet;
+  if (learner.data == TrainingData::kContext) data.trajectories.clear();
+  if (learner.data != TrainingData::kFleet) {
+    data.trajectories.push_back(context);
+    data.trajectories.back().name = "target";
+  }
+  absl::StatusOr<nssm::Bundle> bundle = meta::Train(spec, data, nullptr, executor, nullptr);
+  if (!bundle.ok()) return base::Annotate(bundle.status(), learner.label);
+  return bundle;
+}
+
+SystemModel ModelOf(const nssm::Bundle& bundle) {
+  const auto shared = std::make_shared<const nssm::Bundle>(bundle);
+  const auto predict = [shared](const Trajectory& recording, nssm::PredictionMode mode) -> absl::StatusOr<MatrixXd> {
+    METAEKF_ASSIGN_OR_RETURN(nssm::Prediction prediction, nssm::Predict(*shared, recording, mode));
+    return shared->model.spec().is_case_one() ? std::move(prediction.outputs) : std::move(prediction.states);
+  };
+  return {.warmup = bundle.model.spec().warmup(), .predict = predict};
+}
+
+absl::StatusOr<SystemModel> AdaptToContext(const nssm::Bundle& bundle, const Trajectory& context) {
+  METAEKF_ASSIGN_OR_RETURN(const meta::AdaptationOptions options, meta::DefaultAdaptation(bundle));
+  nssm::Bundle adapted = bundle;
+  if (options.inner_loop.steps > 0) {
+    METAEKF_ASSIGN_OR_RETURN(adapted.parameters, meta::AdaptedParameters(bundle, context, options));
+  }
+  return ModelOf(adapted);
+}
+
+absl::StatusOr<MatrixXd> PredictFreely(const SystemModel& model, const Trajectory& recording, int64_t from) {
+  return PredictInBlocks(model, recording, from, recording.length() - from);
+}
+
+absl::StatusOr<MatrixXd> PredictInBlocks(const SystemModel& model, const Trajectory& recording, int64_t from,
+                                         int64_t horizon) {
+  METAEKF_RETURN_IF_ERROR(CheckWarmup(model, from));
+  MatrixXd predictions;
+  for (int64_t first = from; first < recording.length(); first += horizon) {
+    METAEKF_ASSIGN_OR_RETURN(const Trajectory piece, Cut(recording, first - model.warmup, model.warmup + horizon));
+    METAEKF_ASSIGN_OR_RETURN(const MatrixXd block, model.predict(piece, nssm::PredictionMode::kSimulate));
+    if (predictions.size() == 0) predictions.resize(block.rows(), recording.length() - from);
+    const Eigen::Index columns = piece.length() - model.warmup;
+    predictions.middleCols(first - from, columns) = block.rightCols(columns);
+  }
+  return predictions;
+}
+
+}  // namespace metaekf::experiments

@@ -1,0 +1,336 @@
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "core/base/numbers.h"
+#include "core/base/status.h"
+#include "core/data/split.h"
+#include "core/experiments/classical.h"
+#include "core/experiments/jobs.h"
+#include "core/experiments/learner.h"
+#include "core/experiments/studies.h"
+#include "core/plot/svg.h"
+#include "core/sim/simulate.h"
+
+namespace metaekf::experiments {
+namespace {
+
+using data::Trajectory;
+using Eigen::MatrixXd;
+using nlohmann::json;
+
+constexpr int64_t kContextSamples = 400;
+constexpr int64_t kHorizon = 5;           // H_p of the paper
+constexpr uint64_t kFirstSeed = 1;        // of the runs; hyperparameters were chosen on seeds from 1000 on
+constexpr uint64_t kTargetSeeds = 1 << 20;  // added: targets are no systems of the fleet
+constexpr int kArxOrder = 5;
+constexpr double kInfinity = std::numeric_limits<double>::infinity();
+
+struct Scale {
+  int runs;
+  int64_t sources;
+  std::optional<int64_t> source_samples;  // without it, drawn for each: 10 to 40 s
+  int64_t predicted_samples;
+  bool short_training;
+};
+
+Scale ScaleOf(const Options& options) {
+  Scale scale = options.budget == Budget::kFull    ? Scale{20, 200, {}, 3000, false}
+                : options.budget == Budget::kQuick ? Scale{4, 200, {}, 3000, false}
+                                                   : Scale{2, 4, 400, 30, true};
+  if (options.seeds) scale.runs = *options.seeds;
+  return scale;
+}
+
+/// One architecture for all: x⁺ = x + 𝓓x 𝓐 𝓔 x with linear 𝓔 and 𝓓.
+constexpr char kCommon[] = R"json({
+  "model": {
+    "case": "STATE_INPUT_OUTPUT", "latent_size": 4, "precision": "FLOAT64",
+    "transition": {"form": "AUTONOMOUS", "bypass": "SKIP",
+                   "block": {"hidden_widths": [24], "activation": "TANH", "output_scale": 0.01}}
+  },
+  "loss": {"horizon": 50, "stride": 50, "rollout": "STATE"},
+  "context_samples": 400, "target_samples": 400, "task_batch": 8, "clip_norm": 1, "validation_period": 50,
+  "iterations": 4600, "warmup_iterations": 4000, "warmup_horizon": 20,
+  "warmup_lr": 0.01, "outer_lr": 0.001, "final_outer_lr": 5e-5
+})json";
+
+struct Variant {
+  const char* label;
+  TrainingData data;
+  const char* changes;  // to kCommon
+};
+
+constexpr Variant kVariants[] = {
+    {"MAML", TrainingData::kFleet, R"json({
+       "algorithm": "MAML",
+       "inner_loop": {"steps": 10, "learning_rate": 1.5e-4, "adapted_mask": "transition"},
+       "adaptation": {"steps": 40}})json"},
+    {"Gaussian prior", TrainingData::kFleet, R"json({
+       "algorithm": "GAUSSIAN_PRIOR",
+       "gaussian_prior": {"rounds": 2, "first_steps": 30, "round_steps": 8},
+       "adaptation": {"optimiser": "LEVENBERG_MARQUARDT", "steps": 40}})json"},
+    {"SSM", TrainingData::kContext, R"json({
+       "algorithm": "SUPERVISED", "task_batch": 1, "validation_share": 0, "iterations": 400, "warmup_iterations": 0,
+       "outer_lr": 0.01, "adaptation": {"steps": 0}})json"},
+    {"All-NoAdapt", TrainingData::kFleetAndContext, R"json({
+       "algorithm": "SUPERVISED", "adaptation": {"steps": 0}})json"},
+    {"Xfer", TrainingData::kFleet, R"json({
+       "algorithm": "SUPERVISED",
+       "adaptation": {"steps": 40, "optimiser": "ADAM", "learning_rate": 1e-3}})json"},
+};
+constexpr const char* kMetaLearners[] = {"MAML", "Gaussian prior"};
+constexpr const char* kBaselines[] = {"SSM", "All-NoAdapt", "Xfer"};
+
+std::vector<Learner> Learners(const Scale& scale) {
+  std::vector<Learner> learners;
+  for (const Variant& variant : kVariants) {
+    json specification = json::parse(kCommon);
+    specification.merge_patch(json::parse(variant.changes));
+    if (scale.short_training) {
+      specification.merge_patch(
+          {{"iterations", 12}, {"warmup_iterations", 6}, {"gaussian_prior", {{"rounds", 1}, {"restarts", 1}, {"first_steps", 5}, {"round_steps", 2}}}});
+    }
+    learners.push_back({variant.label, variant.data, std::move(specification)});
+  }
+  return learners;
+}
+
+std::vector<ClassicalModel> ClassicalModels() {
+  return {Arx(kArxOrder), OutputError(kArxOrder), PolynomialNarx(1, 3)};
+}
+
+sim::Request FleetOf(const Scale& scale, uint64_t seed) {
+  return {.system = "van-der-pol", .systems = scale.sources, .seed = seed, .steps = scale.source_samples};
+}
+
+/// The first run's target is the paper's, the others are drawn as the fleet is.
+sim::Request TargetOf(const Scale& scale, uint64_t seed) {
+  sim::Request request{.system = "van-der-pol", .systems = 1, .seed = seed + kTargetSeeds,
+                       .steps = kContextSamples + scale.predicted_samples};
+  if (seed == kFirstSeed) request.settings["nominal"] = "1";
+  return request;
+}
+
+json Protocol(const Options& options) {
+  const Scale scale = ScaleOf(options);
+  json learners = json::array(), classical = json::array();
+  for (const Learner& learner : Learners(scale)) learners.push_back(ToJson(learner));
+  for (const ClassicalModel& model : ClassicalModels()) classical.push_back(model.label);
+  return {{"experiment", "van-der-pol-comparison"},
+          {"runs", scale.runs},
+          {"first_seed", kFirstSeed},
+          {"target_seed", absl::StrCat("seed + ", kTargetSeeds)},
+          {"first_target", "the paper's: theta 1.572, x (1, -0.5)"},
+          {"sources", scale.sources},
+          {"noise_std", 0},
+          {"context_samples", kContextSamples},
+          {"predicted_samples", scale.predicted_samples},
+          {"block_horizon", kHorizon},
+          {"learners", learners},
+          {"classical", classical}};
+}
+
+/// What one model of one run has achieved. Infinite where it diverged.
+struct Trial {
+  double free_run = kInfinity, in_blocks = kInfinity, one_step = kInfinity;  // Σ (x − x̂)² over samples and components
+  double training_s = 0, adaptation_s = 0;
+  MatrixXd free_states;
+};
+
+double SquaredError(const MatrixXd& prediction, const MatrixXd& truth) {
+  const double error = (prediction - truth).squaredNorm();
+  return std::isfinite(error) ? error : kInfinity;
+}
+
+absl::Status Judge(const SystemModel& model, const Trajectory& recording, Trial* trial) {
+  const MatrixXd truth = recording.states.rightCols(recording.length() - kContextSamples);
+  METAEKF_ASSIGN_OR_RETURN(trial->free_states, PredictFreely(model, recording, kContextSamples));
+  METAEKF_ASSIGN_OR_RETURN(const MatrixXd in_blocks, PredictInBlocks(model, recording, kContextSamples, kHorizon));
+  METAEKF_ASSIGN_OR_RETURN(const MatrixXd one_step, model.predict(recording, nssm::PredictionMode::kOneStep));
+  trial->free_run = SquaredError(trial->free_states, truth);
+  trial->in_blocks = SquaredError(in_blocks, truth);
+  trial->one_step = SquaredError(one_step.rightCols(truth.cols()), truth);
+  return absl::OkStatus();
+}
+
+/// A model that diverged in training or adaptation has failed its run, and no more.
+bool IsDivergence(const absl::Status& status) { return absl::IsOutOfRange(status); }
+
+absl::StatusOr<Trial> RunTrial(const Scale& scale, uint64_t seed, size_t model_index) {
+  const std::unique_ptr<base::Executor> serial = base::MakeSerialExecutor();
+  METAEKF_ASSIGN_OR_RETURN(const sim::Fleet target, sim::Simulate(TargetOf(scale, seed), *serial));
+  const Trajectory& recording = target.dataset.trajectories[0];
+  METAEKF_ASSIGN_OR_RETURN(const Trajectory context, data::FirstSamples(recording, kContextSamples));
+  const std::vector<Learner> learners = Learners(scale);
+  Trial trial;
+  const double begin = ThreadSeconds();
+  if (model_index >= learners.size()) {
+    METAEKF_ASSIGN_OR_RETURN(const SystemModel model, ClassicalModels()[model_index - learners.size()].fit(context));
+    trial.adaptation_s = ThreadSeconds() - begin;
+    METAEKF_RETURN_IF_ERROR(Judge(model, recording, &trial));
+    return trial;
+  }
+  METAEKF_ASSIGN_OR_RETURN(const sim::Fleet fleet, sim::Simulate(FleetOf(scale, seed), *serial));
+  const absl::StatusOr<nssm::Bundle> bundle = TrainLearner(learners[model_index], fleet.dataset, context, seed, serial.get());
+  if (IsDivergence(bundle.status())) return trial;
+  METAEKF_RETURN_IF_ERROR(bundle.status());
+  const double trained = ThreadSeconds();
+  trial.training_s = trained - begin;
+  const absl::StatusOr<SystemModel> model = AdaptToContext(*bundle, context);
+  trial.adaptation_s = ThreadSeconds() - trained;
+  if (IsDivergence(model.status())) return trial;
+  METAEKF_RETURN_IF_ERROR(model.status());
+  METAEKF_RETURN_IF_ERROR(Judge(*model, recording, &trial));
+  return trial;
+}
+
+/// Trials of every model in turn, one per run.
+struct Results {
+  std::vector<std::string> labels;
+  std::vector<std::vector<Trial>> trials;
+
+  std::vector<double> Values(size_t model, double Trial::*quantity) const {
+    std::vector<double> values;
+    for (const Trial& trial : trials[model]) values.push_back(trial.*quantity);
+    return values;
+  }
+  size_t IndexOf(const std::string& label) const {
+    return static_cast<size_t>(std::find(labels.begin(), labels.end(), label) - labels.begin());
+  }
+  double MedianFreeRun(const std::string& label) const {
+    return Summarise(Values(IndexOf(label), &Trial::free_run), false).median;
+  }
+};
+
+Table Errors(const Results& results, const Scale& scale) {
+  Table table{.name = "errors",
+              .title = absl::StrCat("Sum of squared errors of both states over ", scale.predicted_samples,
+                                    " samples after a context of ", kContextSamples, "; median [quartiles] of ", scale.runs,
+                                    " runs"),
+              .row_heading = "model",
+              .columns = {{"free run"}, {"5 steps ahead"}, {"1 step ahead"}}};
+  for (size_t i = 0; i < results.labels.size(); ++i) {
+    table.rows.push_back({results.labels[i],
+                          {results.Values(i, &Trial::free_run), results.Values(i, &Trial::in_blocks),
+                           results.Values(i, &Trial::one_step)}});
+  }
+  table.notes = {"Data are free of noise, and the system is a polynomial of degree 3: the polynomial NARX model is exact."};
+  return table;
+}
+
+Table Times(const Results& results) {
+  Table table{.name = "times", .title = "Processor time", .row_heading = "model",
+              .columns = {{"training", "s"}, {"adaptation or fit", "s"}}};
+  for (size_t i = 0; i < results.labels.size(); ++i) {
+    table.rows.push_back(
+        {results.labels[i], {results.Values(i, &Trial::training_s), results.Values(i, &Trial::adaptation_s)}});
+  }
+  return table;
+}
+
+/// The label with the least median error in free run.
+template <size_t N>
+std::string Best(const Results& results, const char* const (&labels)[N]) {
+  return *std::min_element(std::begin(labels), std::end(labels), [&results](const char* a, const char* b) {
+    return results.MedianFreeRun(a) < results.MedianFreeRun(b);
+  });
+}
+
+std::vector<std::string> Findings(const Results& results) {
+  const std::string learner = Best(results, kMetaLearners), baseline = Best(results, kBaselines);
+  const double reference = results.MedianFreeRun(baseline);
+  const auto ratio = [&](const std::string& label) { return base::FormatShort(results.MedianFreeRun(label) / reference, 3); };
+  size_t diverged = 0;
+  for (const auto& trials : results.trials) {
+    diverged += static_cast<size_t>(
+        std::count_if(trials.begin(), trials.end(), [](const Trial& trial) { return std::isinf(trial.free_run); }));
+  }
+  return {absl::StrCat("Best of the supervised and transferred models in free run: ", baseline, "."),
+          absl::StrCat("Median error of ", learner, ", the best meta-learner, in its ratio to that: ", ratio(learner), "."),
+          absl::StrCat("Median error of MAML in the same ratio: ", ratio("MAML"), "."),
+          absl::StrCat("Runs that diverged, of all models: ", diverged, ".")};
+}
+
+/// Cumulative squared error of one trial.
+std::vector<double> Growth(const Trial& trial, const MatrixXd& truth) {
+  std::vector<double> growth;
+  double sum = 0;
+  for (Eigen::Index t = 0; t < truth.cols(); ++t) {
+    sum += trial.free_states.cols() == truth.cols() ? (trial.free_states.col(t) - truth.col(t)).squaredNorm() : kInfinity;
+    growth.push_back(std::isfinite(sum) ? sum : kInfinity);
+  }
+  return growth;
+}
+
+std::vector<double> RowOf(const MatrixXd& matrix, Eigen::Index row) {
+  std::vector<double> values(static_cast<size_t>(matrix.cols()));
+  for (size_t t = 0; t < values.size(); ++t) values[t] = matrix(row, static_cast<Eigen::Index>(t));
+  return values;
+}
+
+/// States of the first run, and the growth of the error, median of all runs.
+absl::StatusOr<Picture> Draw(const Results& results, const std::vector<MatrixXd>& truths, double period_s) {
+  std::vector<double> times;
+  for (Eigen::Index t = 0; t < truths[0].cols(); ++t) times.push_back(static_cast<double>(t + kContextSamples) * period_s);
+  plot::Figure figure{.title = "Free run after 4 s of context", .x_label = "t (s)"};
+  for (const Eigen::Index state : {0, 1}) {
+    plot::Panel panel{.y_label = absl::StrCat("x", state + 1, " (run 1)")};
+    panel.series.push_back({.label = "true", .x = times, .y = RowOf(truths[0], state), .mark = plot::Mark::kDashes,
+                            .colour = plot::Colour::kBlack});
+    for (const Variant& variant : kVariants) {
+      const Trial& trial = results.trials[results.IndexOf(variant.label)][0];
+      if (trial.free_states.cols() != truths[0].cols()) continue;
+      panel.series.push_back({.label = variant.label, .x = times, .y = RowOf(trial.free_states, state)});
+    }
+    figure.panels.push_back(std::move(panel));
+  }
+  plot::Panel errors{.y_label = "SSE so far, median", .logarithmic_y = true};
+  for (size_t i = 0; i < results.labels.size(); ++i) {
+    std::vector<std::vector<double>> at(times.size());
+    for (size_t run = 0; run < truths.size(); ++run) {
+      const std::vector<double> growth = Growth(results.trials[i][run], truths[run]);
+      for (size_t t = 0; t < times.size(); ++t) at[t].push_back(growth[t]);
+    }
+    plot::Series series{.label = results.labels[i], .x = times,
+                        .mark = i < std::size(kVariants) ? plot::Mark::kLine : plot::Mark::kDashes};
+    for (const auto& values : at) series.y.push_back(Summarise(values, false).median);
+    errors.series.push_back(std::move(series));
+  }
+  figure.panels.push_back(std::move(errors));
+  METAEKF_ASSIGN_OR_RETURN(std::string svg, plot::RenderSvg(figure));
+  return Picture{"van-der-pol-comparison", std::move(svg)};
+}
+
+absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, const OnProgress& on_progress) {
+  const Scale scale = ScaleOf(options);
+  Results results;
+  for (const Variant& variant : kVariants) results.labels.emplace_back(variant.label);
+  for (const ClassicalModel& model : ClassicalModels()) results.labels.push_back(model.label);
+  const size_t models = results.labels.size(), runs = static_cast<size_t>(scale.runs);
+  results.trials.assign(models, std::vector<Trial>(runs));
+  METAEKF_RETURN_IF_ERROR(RunJobs(models * runs, executor, "models trained", on_progress, [&](size_t job) {
+    const size_t run = job / models, model = job % models;
+    METAEKF_ASSIGN_OR_RETURN(results.trials[model][run], RunTrial(scale, kFirstSeed + run, model));
+    return absl::OkStatus();
+  }));
+  std::vector<MatrixXd> truths;
+  double period_s = 0;
+  const std::unique_ptr<base::Executor> serial = base::MakeSerialExecutor();
+  for (size_t run = 0; run < runs; ++run) {
+    METAEKF_ASSIGN_OR_RETURN(const sim::Fleet target, sim::Simulate(TargetOf(scale, kFirstSeed + run), *serial));
+    truths.push_back(target.dataset.trajectories[0].states.rightCols(scale.predicted_samples));
+    period_s = target.dataset.trajectories[0].sample_period_s;
+  }
+  METAEKF_ASSIGN_OR_RETURN(Picture picture, Draw(results, truths, period_s));
+  return Report{{Errors(results, scale), Times(results)}, Findings(results), {std::move(picture)}};
+}
+
+}  // namespace
+
+Experiment VanDerPolComparison() {
+  return {"van-der-pol-comparison",
+          "MAML and a learned prior against supervised and transfer learning on van der Pol oscillators", Protocol, Run};
+}
+
+}  // namespace metaekf::experiments
