@@ -60,7 +60,32 @@ constexpr char kTiny[] = R"json({
   "gaussian_prior": {"restarts": 1, "rounds": 1, "first_steps": 4, "round_steps": 2}
 })json";
 
+/// paper.tex section bw_example: H = 20, ELU, n_ψ = 16, both learning rates 1e-3, M = 40. Horizon and sets are ours.
+constexpr char kPrinted[] = R"json({
+  "algorithm": "MAML",
+  "model": {
+    "case": "INPUT_OUTPUT", "latent_size": 16, "window": 20,
+    "encoder": {"hidden_widths": [256, 128, 128, 64, 64, 32, 32], "activation": "ELU"},
+    "transition": {"form": "JOINT", "block": {"hidden_widths": [256, 256, 256, 256, 256], "activation": "ELU"}},
+    "output_decoder": {"hidden_widths": [32, 32, 64, 64, 128, 128, 256], "activation": "ELU"}
+  },
+  "loss": {"horizon": 20, "stride": 100},
+  "inner_loop": {"steps": 5, "learning_rate": 1e-3},
+  "adaptation": {"steps": 40},
+  "context_samples": 500, "target_samples": 500, "task_batch": 2, "clip_norm": 1, "validation_period": 100,
+  "iterations": 320, "warmup_iterations": 300, "warmup_lr": 1e-3, "outer_lr": 1e-3, "final_outer_lr": 1e-4
+})json";
+
 }  // namespace
+
+Learner PrintedMaml(Budget budget) {
+  Learner learner{"MAML, printed network, 320 iterations", TrainingData::kFleet, json::parse(kPrinted)};
+  if (budget == Budget::kTiny) {
+    learner.specification.merge_patch(json::parse(kTiny));
+    learner.specification.merge_patch(json::parse(R"json({"adaptation": {"steps": 2}, "inner_loop": {"steps": 1}})json"));
+  }
+  return learner;
+}
 
 std::vector<Learner> BoucWenLearners(Budget budget) {
   std::vector<Learner> learners;
@@ -86,7 +111,7 @@ absl::StatusOr<SystemModel> FitFromScratch(const nssm::Bundle& bundle, const dat
 }
 
 absl::StatusOr<std::vector<nssm::Bundle>> TrainAll(const std::vector<Learner>& learners, const data::Dataset& fleet,
-                                                   uint64_t seed, base::Executor* executor, const OnProgress& on_progress,
+                                                   const data::Trajectory& context, uint64_t seed, base::Executor* executor, const OnProgress& on_progress,
                                                    std::vector<double>* seconds) {
   using Clock = std::chrono::steady_clock;
   std::vector<nssm::Bundle> bundles;
@@ -95,7 +120,7 @@ absl::StatusOr<std::vector<nssm::Bundle>> TrainAll(const std::vector<Learner>& l
       return absl::CancelledError("the study was cancelled");
     }
     const Clock::time_point begin = Clock::now();
-    METAEKF_ASSIGN_OR_RETURN(nssm::Bundle bundle, TrainLearner(learner, fleet, {}, seed, executor));
+    METAEKF_ASSIGN_OR_RETURN(nssm::Bundle bundle, TrainLearner(learner, fleet, context, seed, executor));
     bundles.push_back(std::move(bundle));
     seconds->push_back(std::chrono::duration<double>(Clock::now() - begin).count());
   }

@@ -23,7 +23,8 @@ absl::Status WriteText(const std::string& directory, const std::string& name, co
 }  // namespace
 
 const std::vector<Experiment>& Experiments() {
-  static const std::vector<Experiment> experiments = {VanDerPolComparison(), FewShotCurve()};
+  static const std::vector<Experiment> experiments = {VanDerPolComparison(), BoucWenTables(), FewShotCurve(),
+                                                      AnilHeatmap()};
   return experiments;
 }
 

@@ -186,13 +186,14 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
   METAEKF_ASSIGN_OR_RETURN(study.targets, RandomBoucWenTargets(study.scale.targets, study.scale.lengths.back(),
                                                                study.scale.test_samples, kTargetSeed, executor));
   std::vector<double> training_s;
-  METAEKF_ASSIGN_OR_RETURN(study.bundles, TrainAll(study.learners, fleet.dataset, kFirstSeed, executor, on_progress, &training_s));
+  METAEKF_ASSIGN_OR_RETURN(study.bundles, TrainAll(study.learners, fleet.dataset, {}, kFirstSeed, executor,
+                                                   on_progress, &training_s));
 
   const std::vector<std::string> labels = study.Labels();
   const size_t models = labels.size(), targets = study.targets.contexts.size();
   Fits fits(models, {study.scale.lengths.size(), std::vector<std::vector<double>>(targets)});
   std::vector<std::vector<double>> adaptation_s(models, std::vector<double>(targets));
-  METAEKF_RETURN_IF_ERROR(RunJobs(models * targets, executor, "adaptations", on_progress, [&](size_t job) -> absl::Status {
+  const auto judge = [&](size_t job) -> absl::Status {
     const size_t target = job / models, model = job % models;
     const double begin = ThreadSeconds();
     for (size_t i = 0; i < study.scale.lengths.size(); ++i) {
@@ -202,7 +203,8 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
     }
     adaptation_s[model][target] = ThreadSeconds() - begin;
     return absl::OkStatus();
-  }));
+  };
+  METAEKF_RETURN_IF_ERROR(RunJobs(models * targets, executor, "adaptations", on_progress, judge));
   Table times{.name = "times", .title = "Time: training on the wall, adaptation and test of one target at all lengths of a processor",
               .row_heading = "model", .columns = {{"training", "s"}, {"one target", "s"}}};
   for (size_t model = 0; model < models; ++model) {

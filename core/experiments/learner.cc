@@ -76,7 +76,8 @@ SystemModel ModelOf(const nssm::Bundle& bundle) {
 absl::StatusOr<SystemModel> AdaptToContext(const nssm::Bundle& bundle, const Trajectory& context) {
   METAEKF_ASSIGN_OR_RETURN(const meta::AdaptationOptions options, meta::DefaultAdaptation(bundle));
   nssm::Bundle adapted = bundle;
-  if (options.inner_loop.steps > 0) {
+  // Levenberg–Marquardt without a step still chooses the most probable of the fleet's fits.
+  if (options.inner_loop.steps > 0 || options.method == meta::AdaptationMethod::kLevenbergMarquardt) {
     METAEKF_ASSIGN_OR_RETURN(adapted.parameters, meta::AdaptedParameters(bundle, context, options));
   }
   return ModelOf(adapted);

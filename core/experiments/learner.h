@@ -15,7 +15,7 @@ namespace metaekf::experiments {
 enum class TrainingData { kFleet, kFleetAndContext, kContext };
 
 /// A way to come by a neural model of a system: training, then adaptation to the context as the specification says
-/// (`adaptation.steps` 0: none).
+/// (`adaptation.steps` 0: none; of LEVENBERG_MARQUARDT under a learned prior: the most probable of the fleet's fits).
 struct Learner {
   std::string label;
   TrainingData data = TrainingData::kFleet;

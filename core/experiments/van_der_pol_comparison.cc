@@ -36,23 +36,22 @@ struct Scale {
 
 Scale ScaleOf(const Options& options) {
   Scale scale = options.budget == Budget::kFull    ? Scale{20, 200, {}, 3000, false}
-                : options.budget == Budget::kQuick ? Scale{4, 200, {}, 3000, false}
+                : options.budget == Budget::kQuick ? Scale{3, 200, {}, 3000, false}
                                                    : Scale{2, 4, 400, 30, true};
   if (options.seeds) scale.runs = *options.seeds;
   return scale;
 }
 
-/// One architecture for all: x⁺ = x + 𝓓x 𝓐 𝓔 x with linear 𝓔 and 𝓓.
+/// What the gradient-based models share, so that they differ in training alone: x⁺ = 𝓓x 𝓐 𝓔 x with linear 𝓔 and 𝓓.
 constexpr char kCommon[] = R"json({
   "model": {
-    "case": "STATE_INPUT_OUTPUT", "latent_size": 4, "precision": "FLOAT64",
-    "transition": {"form": "AUTONOMOUS", "bypass": "SKIP",
-                   "block": {"hidden_widths": [24], "activation": "TANH", "output_scale": 0.01}}
+    "case": "STATE_INPUT_OUTPUT", "latent_size": 8, "precision": "FLOAT64",
+    "transition": {"form": "AUTONOMOUS", "bypass": "SKIP", "block": {"hidden_widths": [16], "activation": "TANH"}}
   },
-  "loss": {"horizon": 50, "stride": 50, "rollout": "STATE"},
-  "context_samples": 400, "target_samples": 400, "task_batch": 8, "clip_norm": 1, "validation_period": 50,
-  "iterations": 4600, "warmup_iterations": 4000, "warmup_horizon": 20,
-  "warmup_lr": 0.01, "outer_lr": 0.001, "final_outer_lr": 5e-5
+  "loss": {"horizon": 20, "stride": 40, "rollout": "STATE", "output_weight": 0},
+  "context_samples": 400, "target_samples": 400, "task_batch": 4, "clip_norm": 1, "validation_period": 100,
+  "iterations": 4000, "warmup_iterations": 2000, "warmup_horizon": 20,
+  "warmup_lr": 0.01, "outer_lr": 0.003, "final_outer_lr": 1e-4
 })json";
 
 struct Variant {
@@ -63,21 +62,21 @@ struct Variant {
 
 constexpr Variant kVariants[] = {
     {"MAML", TrainingData::kFleet, R"json({
-       "algorithm": "MAML",
-       "inner_loop": {"steps": 10, "learning_rate": 1.5e-4, "adapted_mask": "transition"},
-       "adaptation": {"steps": 40}})json"},
+       "algorithm": "MAML", "iterations": 3000,
+       "inner_loop": {"steps": 5, "learning_rate": 3e-4}, "adaptation": {"steps": 40}})json"},
     {"Gaussian prior", TrainingData::kFleet, R"json({
        "algorithm": "GAUSSIAN_PRIOR",
-       "gaussian_prior": {"rounds": 2, "first_steps": 30, "round_steps": 8},
-       "adaptation": {"optimiser": "LEVENBERG_MARQUARDT", "steps": 40}})json"},
+       "model": {"latent_size": 2, "transition": {"block": {"output_scale": 0.01}}},
+       "loss": {"horizon": 50, "stride": 100, "output_weight": 1}, "validation_share": 0.5,
+       "gaussian_prior": {"restarts": 3, "rounds": 2, "first_steps": 25, "round_steps": 6},
+       "adaptation": {"optimiser": "LEVENBERG_MARQUARDT", "steps": 0}})json"},
     {"SSM", TrainingData::kContext, R"json({
        "algorithm": "SUPERVISED", "task_batch": 1, "validation_share": 0, "iterations": 400, "warmup_iterations": 0,
-       "outer_lr": 0.01, "adaptation": {"steps": 0}})json"},
+       "outer_lr": 0.01, "final_outer_lr": 0.001, "adaptation": {"steps": 0}})json"},
     {"All-NoAdapt", TrainingData::kFleetAndContext, R"json({
        "algorithm": "SUPERVISED", "adaptation": {"steps": 0}})json"},
     {"Xfer", TrainingData::kFleet, R"json({
-       "algorithm": "SUPERVISED",
-       "adaptation": {"steps": 40, "optimiser": "ADAM", "learning_rate": 1e-3}})json"},
+       "algorithm": "SUPERVISED", "adaptation": {"steps": 40, "optimiser": "ADAM", "learning_rate": 3e-4}})json"},
 };
 constexpr const char* kMetaLearners[] = {"MAML", "Gaussian prior"};
 constexpr const char* kBaselines[] = {"SSM", "All-NoAdapt", "Xfer"};
@@ -89,7 +88,8 @@ std::vector<Learner> Learners(const Scale& scale) {
     specification.merge_patch(json::parse(variant.changes));
     if (scale.short_training) {
       specification.merge_patch(
-          {{"iterations", 12}, {"warmup_iterations", 6}, {"gaussian_prior", {{"rounds", 1}, {"restarts", 1}, {"first_steps", 5}, {"round_steps", 2}}}});
+          {{"iterations", 12}, {"warmup_iterations", 6}, {"gaussian_prior", {{"rounds", 1}, {"restarts", 1}, {"first_steps", 4}, {"round_steps", 2}}}});
+      if (specification["adaptation"]["steps"] == 40) specification["adaptation"]["steps"] = 5;
     }
     learners.push_back({variant.label, variant.data, std::move(specification)});
   }
@@ -147,7 +147,8 @@ absl::Status Judge(const SystemModel& model, const Trajectory& recording, Trial*
   const MatrixXd truth = recording.states.rightCols(recording.length() - kContextSamples);
   METAEKF_ASSIGN_OR_RETURN(trial->free_states, PredictFreely(model, recording, kContextSamples));
   METAEKF_ASSIGN_OR_RETURN(const MatrixXd in_blocks, PredictInBlocks(model, recording, kContextSamples, kHorizon));
-  METAEKF_ASSIGN_OR_RETURN(const MatrixXd one_step, model.predict(recording, nssm::PredictionMode::kOneStep));
+  METAEKF_ASSIGN_OR_RETURN(const Trajectory later, data::SamplesFrom(recording, kContextSamples - model.warmup));
+  METAEKF_ASSIGN_OR_RETURN(const MatrixXd one_step, model.predict(later, nssm::PredictionMode::kOneStep));
   trial->free_run = SquaredError(trial->free_states, truth);
   trial->in_blocks = SquaredError(in_blocks, truth);
   trial->one_step = SquaredError(one_step.rightCols(truth.cols()), truth);
@@ -309,11 +310,12 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
   for (const ClassicalModel& model : ClassicalModels()) results.labels.push_back(model.label);
   const size_t models = results.labels.size(), runs = static_cast<size_t>(scale.runs);
   results.trials.assign(models, std::vector<Trial>(runs));
-  METAEKF_RETURN_IF_ERROR(RunJobs(models * runs, executor, "models trained", on_progress, [&](size_t job) {
+  const absl::Status studied = RunJobs(models * runs, executor, "models trained", on_progress, [&](size_t job) {
     const size_t run = job / models, model = job % models;
     METAEKF_ASSIGN_OR_RETURN(results.trials[model][run], RunTrial(scale, kFirstSeed + run, model));
     return absl::OkStatus();
-  }));
+  });
+  METAEKF_RETURN_IF_ERROR(studied);
   std::vector<MatrixXd> truths;
   double period_s = 0;
   const std::unique_ptr<base::Executor> serial = base::MakeSerialExecutor();

@@ -1,0 +1,98 @@
+#include "core/plot/heat_map.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdio>
+
+#include "absl/strings/str_cat.h"
+#include "core/base/numbers.h"
+#include "core/plot/curves.h"
+#include "core/plot/elements.h"
+
+namespace metaekf::plot {
+namespace {
+
+constexpr double kCellWidthPx = 66, kCellHeightPx = 26, kTopPx = 42, kBottomPx = 52, kRightPx = 18;
+
+/// From pale yellow over orange to dark violet: lightness falls evenly, for readers who see no colours.
+std::string ColourAt(double share) {
+  static constexpr std::array<std::array<double, 3>, 4> kStops = {
+      {{255, 246, 204}, {245, 173, 92}, {196, 66, 94}, {58, 15, 92}}};
+  const double place = std::clamp(share, 0.0, 1.0) * (kStops.size() - 1);
+  const size_t below = std::min(static_cast<size_t>(place), kStops.size() - 2);
+  const double weight = place - static_cast<double>(below);
+  std::array<int, 3> rgb{};
+  for (size_t i = 0; i < 3; ++i) {
+    rgb[i] = static_cast<int>(std::lround(kStops[below][i] + weight * (kStops[below + 1][i] - kStops[below][i])));
+  }
+  char text[8];
+  std::snprintf(text, sizeof(text), "#%02x%02x%02x", static_cast<unsigned>(rgb[0]), static_cast<unsigned>(rgb[1]),
+                static_cast<unsigned>(rgb[2]));
+  return text;
+}
+
+/// Share of the colour scale of every value.
+class Scale {
+ public:
+  explicit Scale(const HeatMap& map) : logarithmic_(map.logarithmic) {
+    for (const double value : map.values.reshaped()) {
+      if (IsShown(value, logarithmic_)) range_.Add(Position(value));
+    }
+  }
+  double Share(double value) const {
+    return range_.max > range_.min ? (Position(value) - range_.min) / (range_.max - range_.min) : 0;
+  }
+
+ private:
+  double Position(double value) const { return logarithmic_ ? std::log(value) : value; }
+
+  bool logarithmic_;
+  Range range_;
+};
+
+void DrawCell(double left, double top, double value, double share, std::string& svg) {
+  absl::StrAppend(&svg, "<rect x=\"", Number(left), "\" y=\"", Number(top), "\" width=\"", Number(kCellWidthPx),
+                  "\" height=\"", Number(kCellHeightPx), "\" fill=\"", ColourAt(share), "\" stroke=\"white\"/>\n");
+  const char* ink = share > 0.55 ? " text-anchor=\"middle\" style=\"fill:white\"" : " text-anchor=\"middle\"";
+  Text(left + kCellWidthPx / 2, top + kCellHeightPx / 2 + 4, base::FormatShort(value, 3), ink, svg);
+}
+
+}  // namespace
+
+absl::StatusOr<std::string> RenderSvg(const HeatMap& map) {
+  const auto rows = static_cast<Eigen::Index>(map.rows.size()), columns = static_cast<Eigen::Index>(map.columns.size());
+  if (map.values.size() == 0 || map.values.rows() != rows || map.values.cols() != columns) {
+    return absl::InvalidArgumentError(absl::StrCat("a heat map of ", rows, " rows and ", columns, " columns has ",
+                                                   map.values.rows(), " × ", map.values.cols(), " values"));
+  }
+  double left = 0;
+  for (const std::string& name : map.rows) left = std::max(left, TextWidthPx(name));
+  left += 24;
+  const double width = left + kCellWidthPx * static_cast<double>(columns) + kRightPx;
+  const double bottom = kTopPx + kCellHeightPx * static_cast<double>(rows), height = bottom + kBottomPx;
+  std::string svg = absl::StrCat(
+      "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"", Number(width), "\" height=\"", Number(height), "\" viewBox=\"0 0 ",
+      Number(width), " ", Number(height),
+      "\" font-family=\"DejaVu Sans, Helvetica, Arial, sans-serif\" font-size=\"12\">\n<style>text{fill:#222222}</style>\n"
+      "<rect width=\"100%\" height=\"100%\" fill=\"white\"/>\n");
+  Text(12, 24, map.title, " font-size=\"15\" font-weight=\"bold\"", svg);
+  const Scale scale(map);
+  for (Eigen::Index row = 0; row < rows; ++row) {
+    const double top = kTopPx + kCellHeightPx * static_cast<double>(row);
+    Text(left - 8, top + kCellHeightPx / 2 + 4, map.rows[static_cast<size_t>(row)], " text-anchor=\"end\"", svg);
+    for (Eigen::Index column = 0; column < columns; ++column) {
+      const double value = map.values(row, column);
+      if (!IsShown(value, map.logarithmic)) continue;
+      DrawCell(left + kCellWidthPx * static_cast<double>(column), top, value, scale.Share(value), svg);
+    }
+  }
+  for (Eigen::Index column = 0; column < columns; ++column) {
+    Text(left + kCellWidthPx * (static_cast<double>(column) + 0.5), bottom + 17, map.columns[static_cast<size_t>(column)],
+         " text-anchor=\"middle\"", svg);
+  }
+  Text(left + kCellWidthPx * static_cast<double>(columns) / 2, bottom + 38, map.x_label, " text-anchor=\"middle\"", svg);
+  return svg + "</svg>\n";
+}
+
+}  // namespace metaekf::plot
