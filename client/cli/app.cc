@@ -60,7 +60,7 @@ int Run(const std::vector<std::string>& arguments, Console& console) {
                             ->capture_default_str();
   Command chosen;
   for (auto* add : {AddDoctor, AddSimulate, AddTrain, AddJobs, AddModels, AddAdapt, AddAdaptations,
-                    AddPredict, AddEstimate, AddCompare}) {
+                    AddPredict, AddEstimate, AddCompare, AddReproduce}) {
     add(app, console, chosen);
   }
   try {

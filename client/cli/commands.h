@@ -24,6 +24,7 @@ void AddAdaptations(CLI::App& app, Console& console, Command& chosen);
 void AddPredict(CLI::App& app, Console& console, Command& chosen);
 void AddEstimate(CLI::App& app, Console& console, Command& chosen);
 void AddCompare(CLI::App& app, Console& console, Command& chosen);
+void AddReproduce(CLI::App& app, Console& console, Command& chosen);
 
 /// Lets `command` be what is chosen with `subcommand`.
 inline void OnChosen(CLI::App* subcommand, Command& chosen, Command command) {

@@ -156,7 +156,7 @@ std::vector<std::string> Findings(const Table& table) {
 }
 
 absl::StatusOr<Picture> Draw(const Table& table) {
-  plot::HeatMap map{.title = table.title, .x_label = "share of the target's data adapted to",
+  plot::HeatMap map{.title = "RMSE in a free run of 10 s, mean over runs", .x_label = "share of the target's data adapted to",
                     .values = Eigen::MatrixXd(table.rows.size(), table.columns.size()), .logarithmic = true};
   for (const Column& column : table.columns) map.columns.push_back(column.name);
   for (size_t row = 0; row < table.rows.size(); ++row) {

@@ -24,6 +24,7 @@ constexpr int64_t kHorizon = 5;           // H_p of the paper
 constexpr uint64_t kFirstSeed = 1;        // of the runs; hyperparameters were chosen on seeds from 1000 on
 constexpr uint64_t kTargetSeeds = 1 << 20;  // added: targets are no systems of the fleet
 constexpr int kArxOrder = 5;
+constexpr double kDiverged = 1e8;         // squared error of 3,000 samples: hundreds beyond any oscillation
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
 struct Scale {
@@ -56,26 +57,27 @@ constexpr char kCommon[] = R"json({
 
 struct Variant {
   const char* label;
+  plot::Colour colour;
   TrainingData data;
   const char* changes;  // to kCommon
 };
 
 constexpr Variant kVariants[] = {
-    {"MAML", TrainingData::kFleet, R"json({
+    {"MAML", plot::Colour::kBlue, TrainingData::kFleet, R"json({
        "algorithm": "MAML", "iterations": 3000,
        "inner_loop": {"steps": 5, "learning_rate": 3e-4}, "adaptation": {"steps": 40}})json"},
-    {"Gaussian prior", TrainingData::kFleet, R"json({
+    {"Gaussian prior", plot::Colour::kVermilion, TrainingData::kFleet, R"json({
        "algorithm": "GAUSSIAN_PRIOR",
        "model": {"latent_size": 2, "transition": {"block": {"output_scale": 0.01}}},
        "loss": {"horizon": 50, "stride": 100, "output_weight": 1}, "validation_share": 0.5,
        "gaussian_prior": {"restarts": 3, "rounds": 2, "first_steps": 25, "round_steps": 6},
        "adaptation": {"optimiser": "LEVENBERG_MARQUARDT", "steps": 0}})json"},
-    {"SSM", TrainingData::kContext, R"json({
+    {"SSM", plot::Colour::kGreen, TrainingData::kContext, R"json({
        "algorithm": "SUPERVISED", "task_batch": 1, "validation_share": 0, "iterations": 400, "warmup_iterations": 0,
        "outer_lr": 0.01, "final_outer_lr": 0.001, "adaptation": {"steps": 0}})json"},
-    {"All-NoAdapt", TrainingData::kFleetAndContext, R"json({
+    {"All-NoAdapt", plot::Colour::kPurple, TrainingData::kFleetAndContext, R"json({
        "algorithm": "SUPERVISED", "adaptation": {"steps": 0}})json"},
-    {"Xfer", TrainingData::kFleet, R"json({
+    {"Xfer", plot::Colour::kOrange, TrainingData::kFleet, R"json({
        "algorithm": "SUPERVISED", "adaptation": {"steps": 40, "optimiser": "ADAM", "learning_rate": 3e-4}})json"},
 };
 constexpr const char* kMetaLearners[] = {"MAML", "Gaussian prior"};
@@ -140,7 +142,7 @@ struct Trial {
 
 double SquaredError(const MatrixXd& prediction, const MatrixXd& truth) {
   const double error = (prediction - truth).squaredNorm();
-  return std::isfinite(error) ? error : kInfinity;
+  return error < kDiverged ? error : kInfinity;
 }
 
 absl::Status Judge(const SystemModel& model, const Trajectory& recording, Trial* trial) {
@@ -243,14 +245,15 @@ std::vector<std::string> Findings(const Results& results) {
   const double reference = results.MedianFreeRun(baseline);
   const auto ratio = [&](const std::string& label) { return base::FormatShort(results.MedianFreeRun(label) / reference, 3); };
   size_t diverged = 0;
-  for (const auto& trials : results.trials) {
+  for (size_t i = 0; i < std::size(kVariants); ++i) {
+    const std::vector<Trial>& trials = results.trials[i];
     diverged += static_cast<size_t>(
         std::count_if(trials.begin(), trials.end(), [](const Trial& trial) { return std::isinf(trial.free_run); }));
   }
   return {absl::StrCat("Best of the supervised and transferred models in free run: ", baseline, "."),
           absl::StrCat("Median error of ", learner, ", the best meta-learner, in its ratio to that: ", ratio(learner), "."),
           absl::StrCat("Median error of MAML in the same ratio: ", ratio("MAML"), "."),
-          absl::StrCat("Runs that diverged, of all models: ", diverged, ".")};
+          absl::StrCat("Runs of neural models that diverged: ", diverged, ".")};
 }
 
 /// Cumulative squared error of one trial.
@@ -270,7 +273,7 @@ std::vector<double> RowOf(const MatrixXd& matrix, Eigen::Index row) {
   return values;
 }
 
-/// States of the first run, and the growth of the error, median of all runs.
+/// States of the first run, and the growth of the error, median of all runs: of the neural models.
 absl::StatusOr<Picture> Draw(const Results& results, const std::vector<MatrixXd>& truths, double period_s) {
   std::vector<double> times;
   for (Eigen::Index t = 0; t < truths[0].cols(); ++t) times.push_back(static_cast<double>(t + kContextSamples) * period_s);
@@ -282,19 +285,19 @@ absl::StatusOr<Picture> Draw(const Results& results, const std::vector<MatrixXd>
     for (const Variant& variant : kVariants) {
       const Trial& trial = results.trials[results.IndexOf(variant.label)][0];
       if (trial.free_states.cols() != truths[0].cols()) continue;
-      panel.series.push_back({.label = variant.label, .x = times, .y = RowOf(trial.free_states, state)});
+      panel.series.push_back(
+          {.label = variant.label, .x = times, .y = RowOf(trial.free_states, state), .colour = variant.colour});
     }
     figure.panels.push_back(std::move(panel));
   }
   plot::Panel errors{.y_label = "SSE so far, median", .logarithmic_y = true};
-  for (size_t i = 0; i < results.labels.size(); ++i) {
+  for (size_t i = 0; i < std::size(kVariants); ++i) {
     std::vector<std::vector<double>> at(times.size());
     for (size_t run = 0; run < truths.size(); ++run) {
       const std::vector<double> growth = Growth(results.trials[i][run], truths[run]);
       for (size_t t = 0; t < times.size(); ++t) at[t].push_back(growth[t]);
     }
-    plot::Series series{.label = results.labels[i], .x = times,
-                        .mark = i < std::size(kVariants) ? plot::Mark::kLine : plot::Mark::kDashes};
+    plot::Series series{.label = kVariants[i].label, .x = times, .colour = kVariants[i].colour};
     for (const auto& values : at) series.y.push_back(Summarise(values, false).median);
     errors.series.push_back(std::move(series));
   }

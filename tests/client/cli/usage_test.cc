@@ -37,7 +37,8 @@ TEST(UsageTest, HelpOfEverySubcommandEndsWithZero) {
                               "adaptations delete",
                               "predict",
                               "estimate",
-                              "compare"}) {
+                              "compare",
+                              "reproduce"}) {
     std::istringstream words(command);
     std::vector<std::string> arguments{std::istream_iterator<std::string>(words), {}};
     arguments.push_back("--help");

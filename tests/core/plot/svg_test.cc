@@ -180,5 +180,16 @@ TEST(SvgTest, WritesTheSameToAFile) {
   }
 }
 
+TEST(SvgTest, ALogarithmicXAxisPutsPowersOfTenAtEvenDistances) {
+  Figure figure = OnePanel({.x = {1, 10, 100}, .y = {0, 1, 2}});
+  figure.logarithmic_x = true;
+  const std::string svg = Rendered(figure);
+  EXPECT_THAT(svg, HasSubstr(">10¹</text>"));
+  // On both axes even: a straight line, its middle point half way. Plot area: 78 … 882, 2 % of 2 decades beside it.
+  const std::string linear = Rendered(OnePanel({.x = {0, 1, 2}, .y = {0, 1, 2}}));
+  EXPECT_THAT(svg, HasSubstr("L480 "));
+  EXPECT_THAT(linear, HasSubstr("L480 "));
+}
+
 }  // namespace
 }  // namespace metaekf::plot
