@@ -130,7 +130,7 @@ TEST(MetaGradientTest, TheImplicitGradientMatchesCentralDifferencesOfTheMinimum)
   double worst = 0;
   for (const auto& [index, mask] : {std::pair{0, "encoder.0,transition"}, {5, "*"}}) {
     const ModelCase c = nssm::ModelCases()[static_cast<size_t>(index)];
-    TrainingSpec spec = Spec(c, Algorithm::kImplicitMaml, 300, 0.2);
+    TrainingSpec spec = Spec(c, Algorithm::kImplicitMaml, 600, 0.1);
     spec.inner_loop.proximal = 2;
     spec.implicit_maml = {.cg_steps = 300, .cg_tolerance = 1e-13};
     const double error = RelativeErrorAgainstDifferences(c, mask, spec, 1e-3);

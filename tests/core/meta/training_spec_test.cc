@@ -54,6 +54,7 @@ TEST(TrainingSpecTest, WhatAnAlgorithmCannotUseIsRefusedByName) {
   expect_refused({{"inner_loop", {{"optimiser", "LEVENBERG_MARQUARDT"}}}}, "inner_loop.optimiser");
   expect_refused({{"inner_loop", {{"learned_rates", true}, {"learning_rate", 0}}}}, "inner_loop.learning_rate");
   expect_refused({{"inner_loop", {{"tensor_rates", {{"a", -1}}}}}}, "inner_loop.tensor_rates.a");
+  expect_refused({{"inner_loop", {{"tensor_rates", 3}}}}, "inner_loop.tensor_rates");
   expect_refused({{"implicit_maml", {{"cg_tolerance", 2}}}}, "implicit_maml.cg_tolerance");
 }
 
