@@ -2,6 +2,7 @@
 
 #include <chrono>
 
+#include "absl/strings/str_cat.h"
 #include "core/base/status.h"
 #include "core/meta/adapt.h"
 
@@ -10,17 +11,17 @@ namespace {
 
 using nlohmann::json;
 
-/// Fits in free run over whole recordings: starts fitted, no encoder.
+/// The recipe of deploy/specs/bouc-wen.textproto: fits in free run over whole recordings, starts fitted, no encoder.
 constexpr char kGaussianPrior[] = R"json({
   "algorithm": "GAUSSIAN_PRIOR",
   "model": {
-    "case": "INPUT_OUTPUT", "latent_size": 4, "window": 40, "start": "FITTED", "precision": "FLOAT64",
+    "case": "INPUT_OUTPUT", "latent_size": 5, "window": 40, "start": "FITTED", "precision": "FLOAT64",
     "transition": {"form": "JOINT", "bypass": "LINEAR", "input_time": "NEXT",
-                   "block": {"hidden_widths": [12], "activation": "TANH", "output_scale": 0.1}}
+                   "block": {"hidden_widths": [16], "activation": "TANH", "output_scale": 0.1}}
   },
   "loss": {"whole_set_horizon": true},
-  "gaussian_prior": {"initial_std": 0.1, "first_steps": 40, "round_steps": 10, "rounds": 3},
-  "context_samples": 1000, "target_samples": 1000
+  "gaussian_prior": {"initial_std": 0.1, "restarts": 4, "first_steps": 60, "round_steps": 15, "rounds": 3},
+  "context_samples": 500, "target_samples": 2000, "validation_share": 0.1
 })json";
 
 /// The gradient-based learners: the same transition behind a linear encoder of 20 samples.
@@ -54,6 +55,12 @@ constexpr Variant kVariants[] = {
     {"Xfer", kGradientBased, R"json({"algorithm": "SUPERVISED"})json"},
 };
 
+/// Some minutes for all learners together: a smaller network and fewer steps of everything, for the order of things.
+constexpr char kQuick[] = R"json({
+  "iterations": 700, "warmup_iterations": 600,
+  "gaussian_prior": {"restarts": 3, "first_steps": 40, "round_steps": 10, "rounds": 1}
+})json";
+
 /// For tests: seconds, and nothing is learned.
 constexpr char kTiny[] = R"json({
   "iterations": 6, "warmup_iterations": 3, "context_samples": 120, "target_samples": 120,
@@ -79,11 +86,13 @@ constexpr char kPrinted[] = R"json({
 }  // namespace
 
 Learner PrintedMaml(Budget budget) {
-  Learner learner{"MAML, printed network, 320 iterations", TrainingData::kFleet, json::parse(kPrinted)};
+  Learner learner{.data = TrainingData::kFleet, .specification = json::parse(kPrinted)};
+  if (budget == Budget::kQuick) learner.specification.merge_patch({{"iterations", 40}, {"warmup_iterations", 35}});
   if (budget == Budget::kTiny) {
     learner.specification.merge_patch(json::parse(kTiny));
     learner.specification.merge_patch(json::parse(R"json({"adaptation": {"steps": 2}, "inner_loop": {"steps": 1}})json"));
   }
+  learner.label = absl::StrCat("MAML, printed network, ", learner.specification["iterations"].get<int>(), " iterations");
   return learner;
 }
 
@@ -92,6 +101,7 @@ std::vector<Learner> BoucWenLearners(Budget budget) {
   for (const Variant& variant : kVariants) {
     Learner learner{variant.label, TrainingData::kFleet, json::parse(variant.common)};
     learner.specification.merge_patch(json::parse(variant.changes));
+    if (budget == Budget::kQuick) learner.specification.merge_patch(json::parse(kQuick));
     if (budget == Budget::kTiny) {
       learner.specification.merge_patch(json::parse(kTiny));
       learner.specification["adaptation"]["steps"] = 5;

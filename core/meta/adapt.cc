@@ -1,5 +1,6 @@
 #include "core/meta/adapt.h"
 
+#include <Eigen/Cholesky>
 #include <cmath>
 
 #include "core/base/numbers.h"
@@ -26,6 +27,7 @@ using OnStep = std::function<bool(const AdaptationStep&)>;
 // apart then.
 constexpr int64_t kMaxColumns = 1 << 17;
 
+constexpr int32_t kTailChecks = 50;    // of a trial that may stop early
 constexpr int32_t kScratchSteps = 10;  // times those of an adaptation, as the paper allows its baseline
 constexpr double kScratchLearningRate = 3e-3;
 constexpr double kAdamLearningRate = 1e-3;
@@ -46,7 +48,7 @@ absl::Status CheckFinite(const std::string& signal, const Eigen::MatrixXd& value
 struct FitResult {
   std::vector<double> parameters;
   double loss_before = 0, loss_after = 0;
-  Eigen::MatrixXd information;
+  std::optional<nssm::GaussianPosterior> posterior;
 };
 
 absl::Status Diverged(int32_t step, double loss, double learning_rate) {
@@ -92,10 +94,14 @@ class GradientSteps {
   std::vector<double> m_, v_;
 };
 
+/// Looks at the parameters after a step.
+using Inspect = std::function<void(int32_t step, const std::vector<double>& parameters)>;
+
 /// Runs the adaptation on one piece of context in normalised units. @param pull  λ of ½ λ |ω − ω₀|² beside the loss.
 template <typename T>
 absl::StatusOr<FitResult> Fit(const Bundle& bundle, nssm::LossSpec loss, double pull, const Trajectory& context,
-                              const nn::Mask& mask, const AdaptationOptions& options, const OnStep& on_step) {
+                              const nn::Mask& mask, const AdaptationOptions& options, const OnStep& on_step,
+                              const Inspect& inspect) {
   const nssm::ModelSpec& spec = bundle.model.spec();
   METAEKF_ASSIGN_OR_RETURN(LossShape shape, nssm::ShapeOfLoss(spec, loss, context.length()));
   const int64_t columns = int64_t{shape.rollouts} * shape.horizon;
@@ -123,6 +129,7 @@ absl::StatusOr<FitResult> Fit(const Bundle& bundle, nssm::LossSpec loss, double 
     stepper.Step(step + 1, typed_gradient, &result.parameters);
     nssm::RoundToPrecision(spec.precision, &result.parameters);
     typed.assign(result.parameters.begin(), result.parameters.end());
+    if (inspect) inspect(step + 1, result.parameters);
   }
   if (steps == 0) result.loss_after = result.loss_before;
   return result;
@@ -135,6 +142,16 @@ nssm::GaussianPrior ProximalPrior(const FitPlan& plan, double proximal) {
                             .noise_variance = Eigen::VectorXd::Constant(plan.dynamics.channels(), kUnknownNoiseVariance)};
   if (plan.start) prior.start = identity(plan.start->carry_size());
   return prior;
+}
+
+/// What the information about [ω; c₀] says of ω: the Schur complement integrates c₀ out.
+nssm::GaussianPosterior PosteriorOf(const Eigen::MatrixXd& information, Eigen::Index adapted) {
+  const Eigen::Index starts = information.rows() - adapted;
+  nssm::GaussianPosterior posterior{information.topLeftCorner(adapted, adapted)};
+  if (starts == 0) return posterior;
+  const auto cross = information.bottomLeftCorner(starts, adapted);
+  posterior.information -= cross.transpose() * information.bottomRightCorner(starts, starts).llt().solve(cross);
+  return posterior;
 }
 
 /// Levenberg–Marquardt, in double whatever the model's precision.
@@ -160,7 +177,8 @@ absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const ns
                          ? FitFromScratch(plan, bundle.model, loss, context, {.seed = options.seed, .steps = steps}, tell)
                          : FitSystem(plan, prior, bundle.parameters, context, {.steps = steps}, tell));
   if (stopped) return absl::CancelledError("the adaptation was cancelled");
-  FitResult result{.parameters = std::move(fit.parameters), .information = std::move(fit.fit.information)};
+  FitResult result{.parameters = std::move(fit.parameters),
+                   .posterior = PosteriorOf(fit.fit.information, plan.dynamics.adapted_size())};
   nssm::RoundToPrecision(bundle.model.spec().precision, &result.parameters);
   nssm::RolloutLeastSquares::Workspace workspace(plan.dynamics, data.shape);
   const Eigen::VectorXd weights = prior.noise_variance.cwiseInverse();
@@ -182,14 +200,15 @@ struct Problem {
 };
 
 absl::StatusOr<FitResult> FitAnyPrecision(const Bundle& bundle, const Problem& problem, const Trajectory& context,
-                                          const AdaptationOptions& options, const OnStep& on_step) {
+                                          const AdaptationOptions& options, const OnStep& on_step,
+                                          const Inspect& inspect = nullptr) {
   METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, context));
   if (options.method == AdaptationMethod::kLevenbergMarquardt || bundle.model.spec().fits_start()) {
     return FitByLevenbergMarquardt(bundle, problem.loss, normalised, problem.mask, options, on_step);
   }
   return bundle.model.spec().precision == nssm::Precision::kFloat32
-             ? Fit<float>(bundle, problem.loss, problem.pull, normalised, problem.mask, options, on_step)
-             : Fit<double>(bundle, problem.loss, problem.pull, normalised, problem.mask, options, on_step);
+             ? Fit<float>(bundle, problem.loss, problem.pull, normalised, problem.mask, options, on_step, inspect)
+             : Fit<double>(bundle, problem.loss, problem.pull, normalised, problem.mask, options, on_step, inspect);
 }
 
 absl::StatusOr<TailErrors> ErrorsOf(const Bundle& bundle, const Trajectory& tail) {
@@ -261,6 +280,36 @@ void TakeRates(const InnerLoopSpec& training, AdaptationMethod method, double ot
   if (trained_with) inner_loop->tensor_rates = training.tensor_rates;
 }
 
+/// The adaptation to the head of a context, and what it is worth on the tail.
+struct Trial {
+  TailErrors errors;
+  int32_t steps = 0;  // after which they were reached
+};
+
+/// Where nothing but the data holds the parameters back, the trial stops at the step that simulates the tail best, of
+/// kTailChecks that are tried.
+absl::StatusOr<Trial> RunTrial(const Bundle& bundle, const Problem& problem, const Trajectory& head, const Trajectory& tail,
+                               const AdaptationOptions& options, const OnStep& on_step) {
+  Trial trial{.steps = options.inner_loop.steps};
+  Bundle adapted = bundle;
+  bool first = true;
+  const int32_t period = std::max(1, options.inner_loop.steps / kTailChecks);
+  const Inspect inspect = [&](int32_t step, const std::vector<double>& parameters) {
+    if (step % period != 0 && step != options.inner_loop.steps) return;
+    adapted.parameters = parameters;
+    absl::StatusOr<TailErrors> errors = ErrorsOf(adapted, tail);
+    if (!errors.ok() || (!first && !BetterInFreeRun(*errors, trial.errors))) return;
+    trial = {*std::move(errors), step};
+    first = false;
+  };
+  const bool stops_early = options.method == AdaptationMethod::kFromScratch;
+  METAEKF_ASSIGN_OR_RETURN(FitResult fit, FitAnyPrecision(bundle, problem, head, options, on_step, stops_early ? inspect : nullptr));
+  if (!first) return trial;
+  adapted.parameters = std::move(fit.parameters);
+  METAEKF_ASSIGN_OR_RETURN(trial.errors, ErrorsOf(adapted, tail));
+  return trial;
+}
+
 /// Samples of the context's end that are held out.
 int64_t TailSamples(const nssm::ModelSpec& model, int64_t samples) {
   return std::max<int64_t>(samples / 5, model.warmup() + 1);
@@ -324,22 +373,20 @@ absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& c
   METAEKF_ASSIGN_OR_RETURN(const Trajectory head, data::FirstSamples(problem.context, held_out_from));
   METAEKF_ASSIGN_OR_RETURN(const Trajectory tail, data::SamplesFrom(problem.context, held_out_from));
 
-  Bundle adapted = bundle;
   METAEKF_ASSIGN_OR_RETURN(result.before, ErrorsOf(bundle, tail));
   const OnStep on_trial_step = [&](AdaptationStep step) {
     step.trial = true;
     return !on_step || on_step(step);
   };
-  METAEKF_ASSIGN_OR_RETURN(FitResult trial,
-                           FitAnyPrecision(bundle, problem, head, options, on_trial_step));
-  adapted.parameters = std::move(trial.parameters);
-  METAEKF_ASSIGN_OR_RETURN(result.after, ErrorsOf(adapted, tail));
+  METAEKF_ASSIGN_OR_RETURN(Trial trial, RunTrial(bundle, problem, head, tail, options, on_trial_step));
+  result.after = std::move(trial.errors);
   result.arx = ArxErrors(head, tail, spec.warmup());
 
-  METAEKF_ASSIGN_OR_RETURN(FitResult fit,
-                           FitAnyPrecision(bundle, problem, problem.context, options, on_step));
+  AdaptationOptions whole = options;
+  whole.inner_loop.steps = result.steps = trial.steps;
+  METAEKF_ASSIGN_OR_RETURN(FitResult fit, FitAnyPrecision(bundle, problem, problem.context, whole, on_step));
   result.parameters = std::move(fit.parameters);
-  result.information = std::move(fit.information);
+  result.posterior = std::move(fit.posterior);
   result.context_loss_before = fit.loss_before;
   result.context_loss_after = fit.loss_after;
   return result;

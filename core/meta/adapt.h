@@ -41,12 +41,12 @@ struct AdaptationResult {
   std::vector<double> parameters;  ///< ω_M
   nn::Mask mask;                   ///< which tensors may differ from the meta-learned ones
   int64_t context_samples = 0;
+  int32_t steps = 0;               ///< taken: fewer than asked for where the trial on the head stopped early
   double context_loss_before = 0;  ///< normalised units
   double context_loss_after = 0;
   int64_t tail_samples = 0;        ///< held out for the errors below
   TailErrors before, after, arx;
-  /// kLevenbergMarquardt: the inverse of the parameters' posterior covariance (Laplace), unknowns as FitPlan orders them.
-  Eigen::MatrixXd information;
+  std::optional<nssm::GaussianPosterior> posterior;  ///< kLevenbergMarquardt; of the tensors of `mask`
 };
 
 /// Whether `a` is better than `b` in free run, all outputs together (geometric mean of the ratios, for outputs may have
@@ -73,6 +73,9 @@ int64_t ContextSamplesNeeded(const nssm::ModelSpec& model, const nssm::LossSpec&
 /// The last fifth of the context is held out, the model adapted to the rest, and its errors on the tail noted beside
 /// those of the unadapted model and of a linear ARX model fitted to the same samples. The adaptation that is
 /// returned is then made from the whole context in the same way.
+///
+/// Gradient steps from scratch have neither prior nor meta-learned start to hold them back: the trial keeps the step that
+/// simulates the tail best (its errors are the optimistic ones of a choice), and the adaptation takes as many.
 ///
 /// @param context   one trajectory in physical units.
 /// @param on_step   called after every step, first of the trial, then of the adaptation; false stops it.

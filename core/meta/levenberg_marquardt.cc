@@ -12,6 +12,10 @@ using Eigen::VectorXd;
 namespace {
 
 constexpr double kLargestDamping = 1e10;  // no step at all is left beyond it
+// A step under much damping brings little far from the optimum too: it takes several in a row, with the damping falling, to
+// say that there is no more to gain.
+constexpr int kQuietSteps = 3;
+constexpr double kNothing = 1e-3;  // of the tolerance: a step that promises less is not worth taking
 
 }  // namespace
 
@@ -21,6 +25,7 @@ LevenbergMarquardtResult MinimiseLevenbergMarquardt(const Objective& objective, 
   LevenbergMarquardtResult result{.x = x};
   objective.linearise(result.x, &result.model);
   double damping = options.initial_damping, growth = 2;
+  int quiet_steps = 0;
   while (result.iterations < options.max_iterations && damping < kLargestDamping) {
     const QuadraticModel& model = result.model;
     MatrixXd damped = model.curvature;
@@ -37,7 +42,7 @@ LevenbergMarquardtResult MinimiseLevenbergMarquardt(const Objective& objective, 
     const VectorXd step = -factor.solve(model.gradient);
     // Φ(x) − model(x + δ) = ½ δᵀ (μ D δ − g)
     const double promised = 0.5 * step.dot(damping * scale.cwiseProduct(step) - model.gradient);
-    if (promised <= options.tolerance * model.cost) {
+    if (promised <= kNothing * options.tolerance * model.cost) {
       result.converged = true;
       break;
     }
@@ -60,7 +65,8 @@ LevenbergMarquardtResult MinimiseLevenbergMarquardt(const Objective& objective, 
       result.stopped = true;
       break;
     }
-    if (gained <= options.tolerance * before) {
+    quiet_steps = gained <= options.tolerance * before ? quiet_steps + 1 : 0;
+    if (quiet_steps == kQuietSteps) {
       result.converged = true;
       break;
     }

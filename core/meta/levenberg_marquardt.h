@@ -20,7 +20,7 @@ struct Objective {
 
 struct LevenbergMarquardtOptions {
   int max_iterations = 50;
-  double tolerance = 1e-6;       ///< ends when a step promises or brings less than this share of Φ
+  double tolerance = 1e-6;       ///< ends when steps keep bringing less than this share of Φ
   double initial_damping = 1;    ///< of the curvature's diagonal; less leaps out of the basin that the start is in
 };
 

@@ -33,6 +33,7 @@ struct Bundle {
   ChannelNames names;
   FilterNoise noise;
   std::optional<GaussianPrior> prior;
+  std::optional<GaussianPosterior> posterior;  ///< of a model adapted by Levenberg–Marquardt
   /// Specification of the training, as JSON: `adapt` takes its defaults from it.
   nlohmann::json training;
   /// Where the model comes from: seed, data digest, losses.

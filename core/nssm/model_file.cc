@@ -12,6 +12,7 @@ using base::JsonFields;
 using nlohmann::json;
 
 constexpr char kMetadataKey[] = "metaekf";
+constexpr char kPosteriorName[] = "posterior.information";
 constexpr char kPriorPrefix[] = "prior.";
 
 json ListOf(const Eigen::VectorXd& vector) { return std::vector<double>(vector.begin(), vector.end()); }
@@ -145,6 +146,30 @@ absl::Status StorePriorTensor(const Safetensors::Tensor& tensor, GaussianPrior* 
   return known ? status : invalid("is not part of a prior");
 }
 
+Safetensors::Tensor TensorOf(const GaussianPosterior& posterior) {
+  Safetensors::Tensor tensor{.name = kPosteriorName};
+  for (Eigen::Index i = 0; i < posterior.information.rows(); ++i) {
+    for (Eigen::Index j = 0; j <= i; ++j) tensor.values.push_back(posterior.information(i, j));
+  }
+  tensor.shape = {static_cast<int64_t>(tensor.values.size())};
+  return tensor;
+}
+
+/// @param size  of the adapted parameters.
+absl::StatusOr<GaussianPosterior> ReadPosterior(const Safetensors::Tensor& tensor, int64_t size) {
+  if (static_cast<int64_t>(tensor.values.size()) != size * (size + 1) / 2) {
+    return absl::InvalidArgumentError(absl::StrCat("tensor \"", tensor.name, "\" has ", tensor.values.size(), " elements, the triangle of ",
+                                                   size, " adapted parameters has ", size * (size + 1) / 2));
+  }
+  GaussianPosterior posterior;
+  posterior.information.resize(size, size);
+  const double* value = tensor.values.data();
+  for (Eigen::Index i = 0; i < size; ++i) {
+    for (Eigen::Index j = 0; j <= i; ++j) posterior.information(i, j) = posterior.information(j, i) = *value++;
+  }
+  return posterior;
+}
+
 }  // namespace
 
 std::string WriteModelFile(const Bundle& bundle) {
@@ -242,13 +267,25 @@ std::string WriteAdaptedSubset(const Bundle& bundle, const nn::Mask& mask) {
   for (size_t i = 0; i < mask.size(); ++i) {
     if (mask[i]) file.tensors.push_back(TensorOf(bundle.model.layout().tensors()[i], bundle));
   }
+  if (bundle.posterior) file.tensors.push_back(TensorOf(*bundle.posterior));
   return WriteSafetensors(file);
 }
 
 absl::Status ApplyAdaptedSubset(const std::string& bytes, Bundle* bundle) {
   METAEKF_ASSIGN_OR_RETURN(const Safetensors file, ReadSafetensors(bytes));
   nn::Mask seen(bundle->model.layout().tensors().size(), false);
-  for (const Safetensors::Tensor& tensor : file.tensors) METAEKF_RETURN_IF_ERROR(StoreTensor(tensor, bundle, &seen));
+  int64_t adapted = 0;
+  const Safetensors::Tensor* posterior = nullptr;
+  for (const Safetensors::Tensor& tensor : file.tensors) {
+    if (tensor.name == kPosteriorName) {
+      posterior = &tensor;
+      continue;
+    }
+    METAEKF_RETURN_IF_ERROR(StoreTensor(tensor, bundle, &seen));
+    adapted += static_cast<int64_t>(tensor.values.size());
+  }
+  if (posterior == nullptr) return absl::OkStatus();
+  METAEKF_ASSIGN_OR_RETURN(bundle->posterior, ReadPosterior(*posterior, adapted));
   return absl::OkStatus();
 }
 

@@ -17,10 +17,12 @@ std::string WriteModelFile(const Bundle& bundle);
 /// Errors: InvalidArgument naming the field or tensor that is missing, unknown, misshapen or not finite.
 absl::StatusOr<Bundle> ReadModelFile(const std::string& bytes);
 
-/// The tensors of `mask` alone, as a .safetensors file: what an adaptation stores beside its base version.
+/// The tensors of `mask` alone, as a .safetensors file: what an adaptation stores beside its base version. A posterior goes
+/// with them, as "posterior.information": the lower triangle, row by row.
 std::string WriteAdaptedSubset(const Bundle& bundle, const nn::Mask& mask);
 
 /// Puts an adapted subset over the parameters of its base.
+/// Errors: InvalidArgument naming the tensor that is unknown, misshapen or not finite.
 absl::Status ApplyAdaptedSubset(const std::string& bytes, Bundle* bundle);
 
 }  // namespace metaekf::nssm

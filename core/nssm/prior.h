@@ -17,4 +17,10 @@ struct GaussianPrior {
   Eigen::MatrixXd examples;
 };
 
+/// What is known of the parameters of a system after its context (Laplace): ω ~ N(ω_MAP, information⁻¹). Units and order as
+/// those of GaussianPrior; an unknown start is integrated out.
+struct GaussianPosterior {
+  Eigen::MatrixXd information;  ///< symmetric, positive definite
+};
+
 }  // namespace metaekf::nssm

@@ -117,7 +117,7 @@ std::string AdaptationReceipt(const meta::AdaptationOptions& options,
                               const meta::AdaptationResult& result, double duration_s) {
   v1::Adaptation message;
   message.set_method(ToMessage(options.method));
-  message.mutable_inner_loop()->set_steps(static_cast<uint32_t>(options.inner_loop.steps));
+  message.mutable_inner_loop()->set_steps(static_cast<uint32_t>(result.steps));
   message.mutable_inner_loop()->set_learning_rate(options.inner_loop.learning_rate);
   message.mutable_inner_loop()->set_adapted_mask(options.inner_loop.adapted_mask);
   message.mutable_inner_loop()->mutable_tensor_rates()->insert(

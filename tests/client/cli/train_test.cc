@@ -3,6 +3,7 @@
 
 #include <nlohmann/json.hpp>
 
+#include "absl/strings/str_cat.h"
 #include "tests/client/fake_server.h"
 #include "tests/client/run.h"
 
@@ -48,6 +49,42 @@ TEST_F(TrainTest, WatchingEndsWithTheModelThatWasMade) {
   const auto json = nlohmann::json::parse(outcome.out);
   EXPECT_EQ(json["state"], "succeeded");
   EXPECT_EQ(json["model"], "vdp@3");
+}
+
+std::string Rows(int trajectories, int length) {
+  std::string rows = "trajectory,t,u1,y1\n";
+  for (int s = 0; s < trajectories; ++s) {
+    for (int t = 0; t < length; ++t) {
+      absl::StrAppend(&rows, s, ",", t, ",", (t * 7 + s) % 5, ",", (t * 3 + s) % 4, "\n");
+    }
+  }
+  return rows;
+}
+
+TEST_F(TrainTest, ADryRunEstimatesWithoutAServer) {
+  const std::string transition = "transition { block { hidden_widths: 3 } bypass: LINEAR input_time: NEXT }";
+  const std::string gradients = absl::StrCat("model { case: INPUT_OUTPUT latent_size: 2 window: 4 ", transition,
+                                             " } context_samples: 20 target_samples: 20 iterations: ");
+  const std::string fits = absl::StrCat("model { case: INPUT_OUTPUT latent_size: 2 window: 4 start: FITTED precision: FLOAT64 ",
+                                        transition, " } loss { whole_set_horizon: true } algorithm: GAUSSIAN_PRIOR");
+  const std::string data = TempFile("rows.csv", Rows(5, 150));
+  const auto seconds = [&](const std::string& spec) {
+    const Outcome outcome = RunMetaekf({"train", "--name", "m", "--spec", TempFile("dry.textproto", spec), "--data", data,
+                                        "--dry-run", "--output", "json"});
+    EXPECT_EQ(outcome.status, 0) << outcome.err;
+    const auto json = nlohmann::json::parse(outcome.out);
+    EXPECT_GT(json["estimated_memory_mib"], 1);
+    return json["estimated_duration_s"].get<double>();
+  };
+  EXPECT_GT(seconds(fits), 0);
+  // A thousand times the steps: about as many times the duration.
+  EXPECT_GT(seconds(gradients + "1000000"), 20 * seconds(gradients + "1000"));
+}
+
+TEST_F(TrainTest, ADryRunNamesWhatIsWrong) {
+  const Outcome outcome = RunMetaekf({"train", "--name", "m", "--spec", spec_, "--data", data_, "--dry-run"});
+  EXPECT_EQ(outcome.status, 1);
+  EXPECT_THAT(outcome.err, HasSubstr("model.latent_size"));
 }
 
 TEST_F(TrainTest, AJobThatFailsIsAFailure) {

@@ -102,8 +102,7 @@ TEST(EmpiricalBayesTest, AFewSamplesOfANewSystemAreEnoughToSimulateIt) {
     unadapted_errors += error(bundle);
     EXPECT_LT(error(adapted), 0.1) << "the signal's standard deviation is about 2, the noise's " << kNoise;
     // The posterior is surer than the prior in every direction, and says so.
-    const Index p = bundle.prior->dynamics.rows();
-    const MatrixXd gained = result->information.topLeftCorner(p, p) - bundle.prior->dynamics;
+    const MatrixXd gained = result->posterior->information - bundle.prior->dynamics;
     const VectorXd eigenvalues = gained.selfadjointView<Eigen::Lower>().eigenvalues();
     EXPECT_GT(eigenvalues.minCoeff(), -1e-9 * eigenvalues.maxCoeff());
   }

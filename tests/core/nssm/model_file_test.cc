@@ -54,6 +54,25 @@ TEST(ModelFileTest, AnAdaptedSubsetGoesOverItsBase) {
   }
 }
 
+TEST(ModelFileTest, APosteriorGoesWithTheAdaptedSubset) {
+  const Bundle base = SomeBundle(ModelCases().front());
+  const nn::Mask mask = *nn::ParseMask("output_decoder.0.bias", base.model.layout());
+  Bundle adapted = base;
+  const Eigen::Index p = base.model.spec().output_size;
+  const Eigen::MatrixXd root = Eigen::MatrixXd::Random(p, p);
+  adapted.posterior.emplace().information = root * root.transpose() + Eigen::MatrixXd::Identity(p, p);
+  const std::string subset = WriteAdaptedSubset(adapted, mask);
+  Bundle restored = base;
+  ASSERT_TRUE(ApplyAdaptedSubset(subset, &restored).ok());
+  ASSERT_TRUE(restored.posterior.has_value());
+  EXPECT_EQ(restored.posterior->information, adapted.posterior->information);
+  Safetensors file = *ReadSafetensors(subset);
+  file.tensors.back().values.push_back(1);
+  file.tensors.back().shape[0] += 1;
+  const absl::Status refused = ApplyAdaptedSubset(WriteSafetensors(file), &restored);
+  EXPECT_NE(std::string(refused.message()).find("posterior.information"), std::string::npos) << refused;
+}
+
 TEST(ModelFileTest, WhatIsMissingOrDamagedIsNamed) {
   const Bundle bundle = SomeBundle(ModelCases().front());
   const auto message_without = [&](auto change) {

@@ -1,0 +1,2 @@
+metaekf_test(deploy/zoo_test.cc TIMEOUT 600 DEPS metaekf::core_meta metaekf::core_sim)
+target_compile_definitions(deploy.zoo_test PRIVATE METAEKF_SOURCE_DIR="${PROJECT_SOURCE_DIR}")

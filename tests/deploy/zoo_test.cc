@@ -1,0 +1,83 @@
+// The models that ship: each must load, and still do what deploy/zoo/README.md says of it.
+#include <gtest/gtest.h>
+
+#include <filesystem>
+#include <fstream>
+#include <sstream>
+
+#include "core/base/executor.h"
+#include "core/data/split.h"
+#include "core/meta/adapt.h"
+#include "core/nssm/model_file.h"
+#include "core/nssm/predict.h"
+#include "core/sim/simulate.h"
+
+namespace metaekf {
+namespace {
+
+using data::Trajectory;
+
+const std::string kZoo = std::string(METAEKF_SOURCE_DIR) + "/deploy/zoo";
+
+std::string Contents(const std::string& path) {
+  std::ifstream file(path, std::ios::binary);
+  std::ostringstream bytes;
+  bytes << file.rdbuf();
+  return bytes.str();
+}
+
+Trajectory Simulated(const std::string& system, uint64_t seed, std::optional<int64_t> steps,
+                     const std::map<std::string, std::string>& settings) {
+  const auto executor = base::MakeThreadExecutor(1);
+  const auto fleet = sim::Simulate(
+      {.system = system, .systems = 1, .seed = seed, .steps = steps, .settings = settings}, *executor);
+  EXPECT_TRUE(fleet.ok()) << fleet.status();
+  return fleet->dataset.trajectories[0];
+}
+
+TEST(ZooTest, EveryModelLoadsAndSaysHowItWasMade) {
+  int models = 0;
+  for (const auto& entry : std::filesystem::directory_iterator(kZoo)) {
+    if (entry.path().extension() != ".safetensors") continue;
+    ++models;
+    const auto bundle = nssm::ReadModelFile(Contents(entry.path()));
+    ASSERT_TRUE(bundle.ok()) << entry.path() << ": " << bundle.status();
+    EXPECT_TRUE(meta::DefaultAdaptation(*bundle).ok()) << entry.path();
+    EXPECT_TRUE(bundle->training.contains("seed")) << entry.path();
+  }
+  EXPECT_GE(models, 1);
+}
+
+/// Root mean square errors in m, one step ahead and in free run, on a noise-free multisine of the nominal oscillator, after
+/// adaptation to the first samples of another, noisy one.
+struct BoucWenErrors {
+  double one_step, simulate;
+};
+
+BoucWenErrors AdaptedBoucWen(int64_t samples) {
+  const auto bundle = nssm::ReadModelFile(Contents(kZoo + "/bouc-wen.safetensors"));
+  EXPECT_TRUE(bundle.ok()) << bundle.status();
+  const Trajectory context =
+      *data::FirstSamples(Simulated("bouc-wen", 4242, {}, {{"nominal", "1"}, {"noise_std", "7.5e-6"}}), samples);
+  const Trajectory test = Simulated("bouc-wen", 4243, {}, {{"nominal", "1"}, {"period", "2048"}});
+  nssm::Bundle adapted = *bundle;
+  const auto parameters = meta::AdaptedParameters(*bundle, context, *meta::DefaultAdaptation(*bundle));
+  EXPECT_TRUE(parameters.ok()) << parameters.status();
+  adapted.parameters = *parameters;
+  const auto error = [&](nssm::PredictionMode mode) {
+    return nssm::ScorePredictions({test.outputs}, {nssm::Predict(adapted, test, mode)->outputs}).rmse[0];
+  };
+  return {error(nssm::PredictionMode::kOneStep), error(nssm::PredictionMode::kSimulate)};
+}
+
+// The limits are those that the project has set itself for the measured signal.
+TEST(ZooTest, BoucWenAdaptsToFiveHundredSamples) { EXPECT_LE(AdaptedBoucWen(500).simulate, 1.2e-5); }
+
+TEST(ZooTest, BoucWenAdaptsToOnePeriod) {
+  const BoucWenErrors errors = AdaptedBoucWen(8192);
+  EXPECT_LE(errors.simulate, 3.5e-6);
+  EXPECT_LE(errors.one_step, 3.5e-6);
+}
+
+}  // namespace
+}  // namespace metaekf
