@@ -49,6 +49,7 @@ struct FitResult {
   std::vector<double> parameters;
   double loss_before = 0, loss_after = 0;
   std::optional<nssm::GaussianPosterior> posterior;
+  Eigen::VectorXd unknowns;  // of Levenberg–Marquardt
 };
 
 absl::Status Diverged(int32_t step, double loss, double learning_rate) {
@@ -144,6 +145,16 @@ nssm::GaussianPrior ProximalPrior(const FitPlan& plan, double proximal) {
   return prior;
 }
 
+/// What is to be minimised over what.
+struct Problem {
+  nssm::LossSpec loss;
+  double pull = 0;  // λ of what IMPLICIT_MAML minimises in training too
+  nn::Mask mask;
+  Trajectory context;  // found fit for adaptation
+  Eigen::VectorXd from;  // unknowns of a fit to the head of the context, for Levenberg–Marquardt to go on from
+};
+
+
 /// What the information about [ω; c₀] says of ω: the Schur complement integrates c₀ out.
 nssm::GaussianPosterior PosteriorOf(const Eigen::MatrixXd& information, Eigen::Index adapted) {
   const Eigen::Index starts = information.rows() - adapted;
@@ -155,10 +166,9 @@ nssm::GaussianPosterior PosteriorOf(const Eigen::MatrixXd& information, Eigen::I
 }
 
 /// Levenberg–Marquardt, in double whatever the model's precision.
-absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const nssm::LossSpec& loss, const Trajectory& context,
-                                                  const nn::Mask& mask, const AdaptationOptions& options,
-                                                  const OnStep& on_step) {
-  const FitPlan plan(bundle.model, loss, mask);
+absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const Problem& problem, const Trajectory& context,
+                                                  const AdaptationOptions& options, const OnStep& on_step) {
+  const FitPlan plan(bundle.model, problem.loss, problem.mask);
   const nssm::GaussianPrior prior = bundle.prior ? *bundle.prior : ProximalPrior(plan, options.inner_loop.proximal);
   const int32_t steps = options.inner_loop.steps;
   METAEKF_ASSIGN_OR_RETURN(const nssm::LossData<double> data, plan.dynamics.Cut(context));
@@ -174,11 +184,12 @@ absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const ns
   };
   METAEKF_ASSIGN_OR_RETURN(
       SystemFit fit, options.method == AdaptationMethod::kFromScratch
-                         ? FitFromScratch(plan, bundle.model, loss, context, {.seed = options.seed, .steps = steps}, tell)
-                         : FitSystem(plan, prior, bundle.parameters, context, {.steps = steps}, tell));
+                         ? FitFromScratch(plan, bundle.model, problem.loss, context, {.seed = options.seed, .steps = steps}, tell)
+                         : FitSystem(plan, prior, bundle.parameters, context, {.steps = steps, .from = problem.from}, tell));
   if (stopped) return absl::CancelledError("the adaptation was cancelled");
   FitResult result{.parameters = std::move(fit.parameters),
-                   .posterior = PosteriorOf(fit.fit.information, plan.dynamics.adapted_size())};
+                   .posterior = PosteriorOf(fit.fit.information, plan.dynamics.adapted_size()),
+                   .unknowns = fit.fit.unknowns};
   nssm::RoundToPrecision(bundle.model.spec().precision, &result.parameters);
   nssm::RolloutLeastSquares::Workspace workspace(plan.dynamics, data.shape);
   const Eigen::VectorXd weights = prior.noise_variance.cwiseInverse();
@@ -191,20 +202,12 @@ absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const ns
   return result;
 }
 
-/// What is to be minimised over what.
-struct Problem {
-  nssm::LossSpec loss;
-  double pull = 0;  // λ of what IMPLICIT_MAML minimises in training too
-  nn::Mask mask;
-  Trajectory context;  // found fit for adaptation
-};
-
 absl::StatusOr<FitResult> FitAnyPrecision(const Bundle& bundle, const Problem& problem, const Trajectory& context,
                                           const AdaptationOptions& options, const OnStep& on_step,
                                           const Inspect& inspect = nullptr) {
   METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, context));
   if (options.method == AdaptationMethod::kLevenbergMarquardt || bundle.model.spec().fits_start()) {
-    return FitByLevenbergMarquardt(bundle, problem.loss, normalised, problem.mask, options, on_step);
+    return FitByLevenbergMarquardt(bundle, problem, normalised, options, on_step);
   }
   return bundle.model.spec().precision == nssm::Precision::kFloat32
              ? Fit<float>(bundle, problem.loss, problem.pull, normalised, problem.mask, options, on_step, inspect)
@@ -284,6 +287,7 @@ void TakeRates(const InnerLoopSpec& training, AdaptationMethod method, double ot
 struct Trial {
   TailErrors errors;
   int32_t steps = 0;  // after which they were reached
+  Eigen::VectorXd unknowns;
 };
 
 /// Where nothing but the data holds the parameters back, the trial stops at the step that simulates the tail best, of
@@ -299,13 +303,14 @@ absl::StatusOr<Trial> RunTrial(const Bundle& bundle, const Problem& problem, con
     adapted.parameters = parameters;
     absl::StatusOr<TailErrors> errors = ErrorsOf(adapted, tail);
     if (!errors.ok() || (!first && !BetterInFreeRun(*errors, trial.errors))) return;
-    trial = {*std::move(errors), step};
+    trial = {*std::move(errors), step, {}};
     first = false;
   };
   const bool stops_early = options.method == AdaptationMethod::kFromScratch;
   METAEKF_ASSIGN_OR_RETURN(FitResult fit, FitAnyPrecision(bundle, problem, head, options, on_step, stops_early ? inspect : nullptr));
   if (!first) return trial;
   adapted.parameters = std::move(fit.parameters);
+  trial.unknowns = std::move(fit.unknowns);
   METAEKF_ASSIGN_OR_RETURN(trial.errors, ErrorsOf(adapted, tail));
   return trial;
 }
@@ -364,7 +369,7 @@ absl::StatusOr<std::vector<double>> AdaptedParameters(const Bundle& bundle, cons
 absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& context,
                                        const AdaptationOptions& options, const OnStep& on_step) {
   const nssm::ModelSpec& spec = bundle.model.spec();
-  METAEKF_ASSIGN_OR_RETURN(const Problem problem, Pose(bundle, context, options));
+  METAEKF_ASSIGN_OR_RETURN(Problem problem, Pose(bundle, context, options));
   AdaptationResult result;
   result.mask = problem.mask;
   result.context_samples = context.length();
@@ -384,6 +389,7 @@ absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& c
 
   AdaptationOptions whole = options;
   whole.inner_loop.steps = result.steps = trial.steps;
+  problem.from = std::move(trial.unknowns);
   METAEKF_ASSIGN_OR_RETURN(FitResult fit, FitAnyPrecision(bundle, problem, problem.context, whole, on_step));
   result.parameters = std::move(fit.parameters);
   result.posterior = std::move(fit.posterior);

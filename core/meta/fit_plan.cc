@@ -20,8 +20,8 @@ using nssm::RolloutLeastSquares;
 
 namespace {
 
-constexpr Index kScreeningSamples = 1000;  // of the context, to choose among starts
-constexpr int kScreeningSteps = 4;         // for c₀ of each
+constexpr Index kScreeningSamples = 300;   // of the context, to choose among starts
+constexpr int kScreeningSteps = 3;         // for c₀ of each
 constexpr size_t kContenders = 3;          // starts that go on
 constexpr int kContenderSteps = 10;
 constexpr double kContenderTolerance = 1e-3;
@@ -79,51 +79,61 @@ Belief FitPlan::BeliefOf(const GaussianPrior& prior, const std::vector<double>& 
   return belief;
 }
 
+namespace {
+
+/// The mean and those examples that are the most probable, each with a start c₀ fitted to the first samples.
+absl::StatusOr<std::vector<Candidate>> Screen(const FitPlan& plan, const GaussianPrior& prior, const std::vector<double>& mean,
+                                              const Belief& belief, const Trajectory& normalised) {
+  METAEKF_ASSIGN_OR_RETURN(const Trajectory head,
+                           data::FirstSamples(normalised, std::min(normalised.length(), kScreeningSamples)));
+  const RolloutLeastSquares& screened = plan.start ? *plan.start : plan.dynamics;
+  METAEKF_ASSIGN_OR_RETURN(const LossData<double> few, screened.Cut(plan.start ? head : normalised));
+  RolloutLeastSquares::Workspace workspace(screened, few.shape);
+  const Index adapted = plan.dynamics.adapted_size();
+  const VectorXd weights = prior.noise_variance.cwiseInverse();
+  const Belief start_belief{.mean = VectorXd::Zero(prior.start.rows()), .precision = prior.start, .noise_variance = prior.noise_variance};
+  std::vector<Candidate> candidates;
+  bool mean_simulates = false;
+  for (Index i = -1; i < prior.examples.cols(); ++i) {
+    Candidate candidate{.unknowns = belief.mean};
+    if (i >= 0) candidate.unknowns.head(adapted) = prior.examples.col(i);
+    std::vector<double> parameters = mean;
+    ScatterAdapted(plan.dynamics, candidate.unknowns, &parameters);
+    if (plan.start) {
+      const MapFit fit = FitMap(screened, few, parameters, start_belief, start_belief.mean,
+                                {.optimiser = {.max_iterations = kScreeningSteps, .initial_damping = kWarmDamping}}, &workspace);
+      candidate.unknowns.tail(prior.start.rows()) = fit.unknowns;
+      candidate.cost = fit.cost;
+    } else {
+      candidate.cost = screened.Cost(parameters.data(), VectorXd(), weights, few, &workspace);
+    }
+    candidate.cost += Penalty(belief, candidate.unknowns, adapted);
+    if (!std::isfinite(candidate.cost)) continue;
+    mean_simulates = mean_simulates || i < 0;
+    candidates.push_back(std::move(candidate));
+  }
+  // The mean stays among them: it is rarely near, but the fit from there is the least likely to stall.
+  std::stable_sort(candidates.begin() + (mean_simulates ? 1 : 0), candidates.end(), Cheaper);
+  if (candidates.size() > kContenders) candidates.resize(kContenders);
+  return candidates;
+}
+
+}  // namespace
+
 absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& prior, const std::vector<double>& mean,
                                     const Trajectory& normalised, const SystemFitOptions& options,
                                     const std::function<bool(int, double)>& on_step) {
   METAEKF_RETURN_IF_ERROR(plan.CheckPrior(prior));
   const Belief belief = plan.BeliefOf(prior, mean);
-  const Index adapted = plan.dynamics.adapted_size();
   METAEKF_ASSIGN_OR_RETURN(const LossData<double> data, plan.dynamics.Cut(normalised));
   RolloutLeastSquares::Workspace workspace(plan.dynamics, data.shape);
-
-  std::vector<Candidate> candidates;
-  bool mean_simulates = false;
-  {
-    METAEKF_ASSIGN_OR_RETURN(const Trajectory head,
-                             data::FirstSamples(normalised, std::min(normalised.length(), kScreeningSamples)));
-    const RolloutLeastSquares& screened = plan.start ? *plan.start : plan.dynamics;
-    METAEKF_ASSIGN_OR_RETURN(const LossData<double> few, screened.Cut(plan.start ? head : normalised));
-    RolloutLeastSquares::Workspace screening(screened, few.shape);
-    const VectorXd weights = prior.noise_variance.cwiseInverse();
-    const Belief start_belief{.mean = VectorXd::Zero(prior.start.rows()), .precision = prior.start, .noise_variance = prior.noise_variance};
-    for (Index i = -1; i < prior.examples.cols(); ++i) {
-      Candidate candidate{.unknowns = belief.mean};
-      if (i >= 0) candidate.unknowns.head(adapted) = prior.examples.col(i);
-      std::vector<double> parameters = mean;
-      ScatterAdapted(plan.dynamics, candidate.unknowns, &parameters);
-      if (plan.start) {
-        const MapFit fit = FitMap(screened, few, parameters, start_belief, start_belief.mean,
-                                  {.optimiser = {.max_iterations = kScreeningSteps, .tolerance = 1e-2}}, &screening);
-        candidate.unknowns.tail(prior.start.rows()) = fit.unknowns;
-        candidate.cost = fit.cost;
-      } else {
-        candidate.cost = screened.Cost(parameters.data(), VectorXd(), weights, few, &screening);
-      }
-      candidate.cost += Penalty(belief, candidate.unknowns, adapted);
-      if (!std::isfinite(candidate.cost)) continue;
-      mean_simulates = mean_simulates || i < 0;
-      candidates.push_back(std::move(candidate));
-    }
+  std::vector<Candidate> candidates{{.unknowns = options.from}};
+  if (options.from.size() == 0) {
+    METAEKF_ASSIGN_OR_RETURN(candidates, Screen(plan, prior, mean, belief, normalised));
   }
   if (candidates.empty()) {
     return absl::OutOfRangeError("the fit diverged: neither the meta-learned parameters nor any example simulate this system");
   }
-  // The mean stays among them: it is rarely near, but the fit from there is the least likely to stall.
-  std::stable_sort(candidates.begin() + (mean_simulates ? 1 : 0), candidates.end(), Cheaper);
-  if (candidates.size() > kContenders) candidates.resize(kContenders);
-
   SystemFit result{.parameters = mean};
   bool stopped = false;
   const auto tell = [&](int step, double cost) {
@@ -142,11 +152,11 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
     std::stable_sort(candidates.begin(), candidates.end(), Cheaper);
   }
   result.fit = FitMap(plan.dynamics, data, mean, belief, candidates[0].unknowns,
-                           {.optimiser = {.max_iterations = stopped ? 0 : options.steps,
-                                          .tolerance = options.tolerance,
-                                          .initial_damping = kWarmDamping},
-                            .noise_samples = options.noise_samples},
-                           &workspace, tell);
+                      {.optimiser = {.max_iterations = stopped ? 0 : options.steps,
+                                     .tolerance = options.tolerance,
+                                     .initial_damping = kWarmDamping},
+                       .noise_samples = options.noise_samples},
+                      &workspace, tell);
   ScatterAdapted(plan.dynamics, result.fit.unknowns, &result.parameters);
   return result;
 }

@@ -33,6 +33,8 @@ struct SystemFitOptions {
   double tolerance = 1e-4;
   /// How many samples' worth of evidence the prior's noise variance counts for; infinite: it is not estimated.
   double noise_samples = 200;
+  /// Unknowns of a fit to the head of the same recording: the fit goes on from them alone. Empty: it looks for a start.
+  Eigen::VectorXd from;
 };
 
 /// Fits a system under a prior.

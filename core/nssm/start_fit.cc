@@ -20,9 +20,9 @@ namespace {
 
 enum Slot : int32_t { kParameters, kCarry, kInput, kNextOut, kOutputOut, kByCarryNextOut, kByCarryOutputOut };
 
-constexpr int kPasses = 30;
+constexpr int kPasses = 15;
 constexpr double kFirstDamping = 1e-3, kDampingFactor = 10;
-constexpr double kConverged = 1e-9;  // relative decrease of the cost that a column stops at
+constexpr double kConverged = 1e-6;  // relative decrease of the cost that a column stops at
 
 }  // namespace
 
