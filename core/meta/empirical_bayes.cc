@@ -123,6 +123,7 @@ class Learner {
         FitFromScratch(plan_, model_, spec_.loss, systems_.training[0],
                        {.seed = spec_.seed, .restarts = options_.restarts, .steps = options_.first_steps}, nullptr, &executor_));
     const Index p = plan_.dynamics.adapted_size(), n = first.fit.unknowns.size() - p;
+    start_ = first.parameters;
     Belief& belief = population_.belief;
     belief.mean = first.fit.unknowns;
     belief.mean.tail(n).setZero();
@@ -218,7 +219,7 @@ class Learner {
   /// What the population says of a new system.
   LearnedPrior Current() const {
     const Index p = plan_.dynamics.adapted_size(), n = population_.belief.mean.size() - p;
-    LearnedPrior current{.parameters = model_.InitialParameters(spec_.seed)};
+    LearnedPrior current{.parameters = start_};
     ScatterAdapted(plan_.dynamics, population_.belief.mean, &current.parameters);
     GaussianPrior& prior = current.prior;
     prior.dynamics = population_.belief.precision.topLeftCorner(p, p);
@@ -326,7 +327,8 @@ class Learner {
                      {"precision", Flat(population_.belief.precision)},
                      {"noise_precision", Flat(population_.belief.noise_variance.cwiseInverse())},
                      {"fits", fits},
-                     {"accepted", accepted}};
+                     {"accepted", accepted},
+                     {"start", start_}};
     if (best_.parameters.empty()) return;
     state_.values["best_parameters"] = best_.parameters;
     state_.values["best_dynamics"] = Flat(best_.prior.dynamics);
@@ -357,6 +359,7 @@ class Learner {
       population_.fits.push_back(fits.col(s));
       population_.accepted.push_back(accepted(s, 0) != 0);
     }
+    start_ = Flat(matrix("start", static_cast<Index>(model_.layout().size()), 1));
     round_ = static_cast<int32_t>(round(0, 0));
     state_.iteration = static_cast<int32_t>(round(1, 0));
     state_.best_validation_loss = 1 / round(2, 0);
@@ -384,6 +387,7 @@ class Learner {
   std::vector<SlotWorkspace> workspaces_;
   std::vector<LossData<double>> data_;
   Population population_;
+  std::vector<double> start_;  // ω of the first fit: what does not adapt stays as it found it
   int32_t round_ = 0;
   LearnedPrior best_;
 };

@@ -150,7 +150,7 @@ TEST(EmpiricalBayesTest, OneRoundOnALinearFamilyIsItsClosedForm) {
     const nssm::LossData<double> data = *problem.Cut(system);
     nssm::RolloutLeastSquares::Workspace workspace(problem, data.shape);
     const auto predictions = [&](const VectorXd& theta) -> VectorXd {
-      std::vector<double> parameters = model.InitialParameters(spec.seed);
+      std::vector<double> parameters = first.parameters;
       ScatterAdapted(problem, theta, &parameters);
       return problem.Predictions(parameters.data(), VectorXd(), data, &workspace).reshaped();
     };
@@ -172,8 +172,36 @@ TEST(EmpiricalBayesTest, OneRoundOnALinearFamilyIsItsClosedForm) {
   EXPECT_NEAR(learned->prior.noise_variance[0], variances[3], 1e-3 * variances[3]);
 }
 
+// A restart begins from a random network of its own, which the prior has to keep where it does not adapt: the expected
+// values are the first fit's.
+TEST(EmpiricalBayesTest, WhatDoesNotAdaptStaysAsInTheFirstFit) {
+  TrainingSpec spec = Spec();
+  spec.model.input_size = spec.model.output_size = 1;
+  spec.gaussian_prior.rounds = 1;
+  const nssm::Model model = *nssm::Model::Create(spec.model);
+  const nn::Mask mask = *nn::ParseMask("transition.*_bypass,output_decoder", model.layout());
+  const Systems systems{.training = Resonators(4, 150, 1).trajectories};
+  const auto executor = base::MakeSerialExecutor();
+  TrainingState state;
+  const absl::StatusOr<LearnedPrior> learned =
+      LearnGaussianPrior(spec, model, mask, systems, executor.get(), &state, nullptr);
+  ASSERT_TRUE(learned.ok()) << learned.status();
+  const GaussianPriorSpec& options = spec.gaussian_prior;
+  const absl::StatusOr<SystemFit> first =
+      FitFromScratch(FitPlan(model, spec.loss, mask), model, spec.loss, systems.training[0],
+                     {.seed = spec.seed, .restarts = options.restarts, .steps = options.first_steps}, nullptr);
+  ASSERT_TRUE(first.ok()) << first.status();
+  for (size_t i = 0; i < mask.size(); ++i) {
+    const nn::Tensor& tensor = model.layout().tensors()[i];
+    for (int64_t k = tensor.offset; !mask[i] && k < tensor.offset + tensor.size(); ++k) {
+      EXPECT_EQ(learned->parameters[static_cast<size_t>(k)], first->parameters[static_cast<size_t>(k)]) << tensor.name;
+    }
+  }
+}
+
 TEST(EmpiricalBayesTest, TheNoiseOfTheFleetIsFoundOut) {
   const nssm::Bundle bundle = *nssm::ReadModelFile(TrainedFile(2));
+  ASSERT_TRUE(bundle.prior);
   const double scale = bundle.normaliser.outputs.scale[0];
   EXPECT_NEAR(std::sqrt(bundle.prior->noise_variance[0]) * scale, kNoise, 0.3 * kNoise);
 }
