@@ -8,6 +8,7 @@
 
 #include "core/base/status.h"
 #include "core/data/split.h"
+#include "core/meta/covariance_structure.h"
 #include "core/meta/fit_plan.h"
 
 namespace metaekf::meta {
@@ -77,6 +78,7 @@ class Learner {
         workspaces_(executor->concurrency()) {}
 
   absl::StatusOr<LearnedPrior> Run() {
+    METAEKF_RETURN_IF_ERROR(CheckStructure(options_, plan_.dynamics.adapted_size()));
     METAEKF_ASSIGN_OR_RETURN(data_, CutAll(plan_.dynamics));
     if (state_.values.empty()) {
       state_.iteration = 0;
@@ -175,16 +177,16 @@ class Learner {
       METAEKF_RETURN_IF_ERROR(Tell(batch));
     }
     state_.training_loss = Median(mean_squares) * belief.noise_variance.minCoeff();
-    Maximise(mean_squares, variances, covariances, plan_.dynamics.adapted_size(), &population_);
+    Maximise(mean_squares, variances, covariances, &population_);
     return absl::OkStatus();
   }
 
-  static void Maximise(const std::vector<double>& mean_squares, const std::vector<VectorXd>& variances,
-                       const std::vector<MatrixXd>& covariances, Index adapted, Population* population) {
+  void Maximise(const std::vector<double>& mean_squares, const std::vector<VectorXd>& variances,
+                const std::vector<MatrixXd>& covariances, Population* population) const {
     std::vector<double> finite;
     for (const double value : mean_squares) finite.push_back(std::isfinite(value) ? value : std::numeric_limits<double>::max());
     const double limit = kStalled * Median(finite);
-    const Index size = population->belief.mean.size(), starts = size - adapted;
+    const Index adapted = plan_.dynamics.adapted_size(), size = population->belief.mean.size(), starts = size - adapted;
     double count = 0;
     VectorXd mean = VectorXd::Zero(size);
     for (size_t s = 0; s < finite.size(); ++s) {
@@ -203,6 +205,8 @@ class Learner {
     }
     covariance.topRightCorner(adapted, starts).setZero();
     covariance.bottomLeftCorner(starts, adapted).setZero();
+    covariance.topLeftCorner(adapted, adapted) =
+        StructuredCovariance(options_, plan_.dynamics.adapted(), covariance.topLeftCorner(adapted, adapted));
     Belief& belief = population->belief;
     belief.mean = mean;
     belief.precision = Inverse(covariance);

@@ -15,13 +15,15 @@ struct LearnedPrior {
 /// Learns ω ~ N(ω₀, Λ⁻¹) over a fleet by expectation–maximisation with Laplace's approximation.
 ///
 ///   E: ω_s = argmin ½ Σ r²/σ² + ½ (ω − ω₀)ᵀ Λ (ω − ω₀),   P_s = (Λ + JᵀJ/σ²)⁻¹       for every system s
-///   M: ω₀ = mean of ω_s,   Λ⁻¹ = mean of (ω_s − ω₀)(ω_s − ω₀)ᵀ + P_s,   σ² = median of the residuals' variance
+///   M: ω₀ = mean of ω_s,   C = mean of (ω_s − ω₀)(ω_s − ω₀)ᵀ + P_s,   σ² = median of the residuals' variance
 ///
+/// Λ⁻¹ is C, or the most likely covariance of the structure that the specification asks for (StructuredCovariance).
 /// The first ω₀ is the best of several fits of one system, each from a start of its own. Systems whose fit has stalled,
 /// recognised by residuals far above the others', do not count in the M-step and begin the next round from the fits of
 /// others. Held-out systems judge every round: the best prior is returned.
 ///
-/// Errors: Cancelled if on_step said so; OutOfRange if no start of the first fit simulates its system.
+/// Errors: InvalidArgument if that structure has a larger rank than there are parameters; Cancelled if on_step said so;
+/// OutOfRange if no start of the first fit simulates its system.
 absl::StatusOr<LearnedPrior> LearnGaussianPrior(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
                                                 const Systems& systems, base::Executor* executor, TrainingState* state,
                                                 const OnTrainingStep& on_step);

@@ -17,6 +17,10 @@ const std::vector<std::pair<std::string, Optimiser>> kOptimisers = {{"GRADIENT_D
                                                                     {"ADAM", Optimiser::kAdam},
                                                                     {"LEVENBERG_MARQUARDT", Optimiser::kLevenbergMarquardt}};
 
+const std::vector<std::pair<std::string, PriorCovariance>> kPriorCovariances = {{"FULL", PriorCovariance::kFull},
+                                                                                {"LOW_RANK", PriorCovariance::kLowRank},
+                                                                                {"BLOCK", PriorCovariance::kBlock}};
+
 constexpr int32_t kGaussianPriorSteps = 60;  // of Levenberg–Marquardt at adaptation
 
 constexpr int32_t kMany = 100'000'000;
@@ -72,6 +76,14 @@ GaussianPriorSpec ReadGaussianPrior(JsonFields* parent) {
   spec.restarts = positive("restarts", spec.restarts);
   spec.first_steps = positive("first_steps", spec.first_steps);
   spec.round_steps = positive("round_steps", spec.round_steps);
+  spec.covariance = fields.Choice("covariance", spec.covariance, kPriorCovariances);
+  spec.rank = positive("rank", spec.rank);
+  if (spec.covariance == PriorCovariance::kLowRank && spec.rank == 0) {
+    fields.Fail("rank", "LOW_RANK needs the number of its factors, 1 at least");
+  }
+  if (spec.covariance != PriorCovariance::kLowRank && spec.rank > 0) {
+    fields.Fail("rank", absl::StrCat("is that of LOW_RANK; the covariance is ", NameOf(kPriorCovariances, spec.covariance)));
+  }
   parent->Include(fields.Finish());
   return spec;
 }
@@ -157,7 +169,9 @@ json ToJson(const TrainingSpec& spec) {
             {"rounds", spec.gaussian_prior.rounds},
             {"restarts", spec.gaussian_prior.restarts},
             {"first_steps", spec.gaussian_prior.first_steps},
-            {"round_steps", spec.gaussian_prior.round_steps}}},
+            {"round_steps", spec.gaussian_prior.round_steps},
+            {"covariance", NameOf(kPriorCovariances, spec.gaussian_prior.covariance)},
+            {"rank", spec.gaussian_prior.rank}}},
           {"implicit_maml", {{"cg_steps", spec.implicit_maml.cg_steps}, {"cg_tolerance", spec.implicit_maml.cg_tolerance}}},
           {"context_samples", spec.context_samples},
           {"target_samples", spec.target_samples},

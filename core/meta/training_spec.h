@@ -24,6 +24,8 @@ struct InnerLoopSpec {
   std::map<std::string, double> tensor_rates;  ///< by the tensor's name; the others' is learning_rate
 };
 
+enum class PriorCovariance { kFull, kLowRank, kBlock };
+
 /// Empirical Bayes: the message GaussianPriorSpec of spec.proto.
 struct GaussianPriorSpec {
   double initial_std = 0.1;
@@ -31,6 +33,8 @@ struct GaussianPriorSpec {
   int32_t restarts = 6;
   int32_t first_steps = 60;
   int32_t round_steps = 10;
+  PriorCovariance covariance = PriorCovariance::kFull;
+  int32_t rank = 0;  ///< R of kLowRank, else 0
 };
 
 /// The message ImplicitMamlSpec of spec.proto.

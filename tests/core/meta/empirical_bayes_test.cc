@@ -9,8 +9,10 @@
 #include <cmath>
 
 #include "core/base/rng.h"
+#include "core/data/split.h"
 #include "core/meta/adapt.h"
 #include "core/meta/arx.h"
+#include "core/meta/covariance_structure.h"
 #include "core/meta/fit_plan.h"
 #include "core/meta/train.h"
 #include "core/nssm/model_file.h"
@@ -73,9 +75,9 @@ TrainingSpec Spec() {
   return spec;
 }
 
-std::string TrainedFile(size_t threads, const TrainingState* resume = nullptr) {
+std::string TrainedFile(size_t threads, const TrainingState* resume = nullptr, const TrainingSpec& spec = Spec()) {
   const auto executor = base::MakeThreadExecutor(threads);
-  const absl::StatusOr<nssm::Bundle> bundle = Train(Spec(), Resonators(12, 300, 1), resume, executor.get(), nullptr);
+  const absl::StatusOr<nssm::Bundle> bundle = Train(spec, Resonators(12, 300, 1), resume, executor.get(), nullptr);
   EXPECT_TRUE(bundle.ok()) << bundle.status();
   return bundle.ok() ? nssm::WriteModelFile(*bundle) : "";
 }
@@ -107,6 +109,56 @@ TEST(EmpiricalBayesTest, AFewSamplesOfANewSystemAreEnoughToSimulateIt) {
     EXPECT_GT(eigenvalues.minCoeff(), -1e-9 * eigenvalues.maxCoeff());
   }
   EXPECT_LT(adapted_errors, 0.1 * unadapted_errors);
+}
+
+TrainingSpec WithFactors(int32_t rank) {
+  TrainingSpec spec = Spec();
+  spec.gaussian_prior.covariance = PriorCovariance::kLowRank;
+  spec.gaussian_prior.rank = rank;
+  return spec;
+}
+
+TEST(EmpiricalBayesTest, APriorOfTwoFactorsIsOneAndIsAdaptedUnder) {
+  const nssm::Bundle bundle = *nssm::ReadModelFile(TrainedFile(2, nullptr, WithFactors(2)));
+  // Frequency and damping are two numbers: beside two factors each parameter has but a variance of its own.
+  const MatrixXd covariance = bundle.prior->dynamics.inverse();
+  const FactorModel model = FitFactors(covariance, 2, {.max_iterations = 1000, .tolerance = 1e-9});
+  EXPECT_LT((model.Covariance() - covariance).norm(), 1e-6 * covariance.norm());
+  double adapted_errors = 0, unadapted_errors = 0;
+  for (uint64_t seed = 100; seed < 105; ++seed) {
+    const Trajectory system = Resonators(1, 800, seed).trajectories[0];
+    const Trajectory context = *data::FirstSamples(system, 60);
+    nssm::Bundle adapted = bundle;
+    adapted.parameters = *AdaptedParameters(bundle, context, *DefaultAdaptation(bundle));
+    const auto error = [&](const nssm::Bundle& model_of) {
+      return nssm::ScorePredictions({system.outputs}, {nssm::Predict(model_of, system, nssm::PredictionMode::kSimulate)->outputs}).rmse[0];
+    };
+    adapted_errors += error(adapted);
+    unadapted_errors += error(bundle);
+  }
+  EXPECT_LT(adapted_errors, 0.2 * unadapted_errors);
+}
+
+TEST(EmpiricalBayesTest, APriorOfFactorsIsBitIdenticalWhateverTheThreadsAndResumed) {
+  const TrainingSpec spec = WithFactors(2);
+  const std::string whole = TrainedFile(1, nullptr, spec);
+  EXPECT_TRUE(TrainedFile(2, nullptr, spec) == whole);
+  const auto executor = base::MakeSerialExecutor();
+  std::string checkpoint;
+  const absl::Status status = Train(spec, Resonators(12, 300, 1), nullptr, executor.get(), [&](const TrainingProgress& p) {
+                                checkpoint = WriteCheckpoint(p.state, "digest");
+                                return p.state.iteration < 20;
+                              }).status();
+  EXPECT_EQ(status.code(), absl::StatusCode::kCancelled);
+  const TrainingState state = *ReadCheckpoint(checkpoint, "digest");
+  EXPECT_TRUE(TrainedFile(2, &state, spec) == whole);
+}
+
+TEST(EmpiricalBayesTest, MoreFactorsThanParametersAreRefusedBeforeAnythingIsFitted) {
+  const auto executor = base::MakeSerialExecutor();
+  const absl::Status status = Train(WithFactors(1000), Resonators(12, 300, 1), nullptr, executor.get(), nullptr).status();
+  EXPECT_EQ(status.code(), absl::StatusCode::kInvalidArgument);
+  EXPECT_EQ(status.message().substr(0, 20), "gaussian_prior.rank:");
 }
 
 /// ŷ = Φθ with Φ of a fixed linear encoder and transition: only the output decoder θ differs from system to system.

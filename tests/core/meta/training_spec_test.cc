@@ -32,6 +32,17 @@ TEST(TrainingSpecTest, WhatIsWrittenReadsBack) {
   EXPECT_EQ(ToJson(*ReadTrainingSpec(ToJson(*read))), ToJson(*read));
 }
 
+TEST(TrainingSpecTest, EveryStructureOfAPriorsCovarianceIsReadAndWritten) {
+  for (const auto& [name, rank] : {std::pair{"FULL", 0}, {"LOW_RANK", 3}, {"BLOCK", 0}}) {
+    const auto spec = ReadTrainingSpec(WithModel({{"gaussian_prior", {{"covariance", name}, {"rank", rank}}}}));
+    ASSERT_TRUE(spec.ok()) << spec.status();
+    EXPECT_EQ(spec->gaussian_prior.rank, rank);
+    EXPECT_EQ(ToJson(*spec)["gaussian_prior"]["covariance"], name);
+    EXPECT_EQ(ToJson(*ReadTrainingSpec(ToJson(*spec))), ToJson(*spec));
+  }
+  EXPECT_EQ(ReadTrainingSpec(WithModel({}))->gaussian_prior.covariance, PriorCovariance::kFull);
+}
+
 TEST(TrainingSpecTest, AdaptationTakesItsRatesFromTheInnerLoopUnlessItHasItsOwn) {
   const json inner = {{"learned_rates", true}, {"tensor_rates", {{"a", 1}}}};
   const auto own = ReadTrainingSpec(WithModel({{"inner_loop", inner}, {"adaptation", {{"tensor_rates", {{"b", 2}}}}}}));
@@ -56,6 +67,10 @@ TEST(TrainingSpecTest, WhatAnAlgorithmCannotUseIsRefusedByName) {
   expect_refused({{"inner_loop", {{"tensor_rates", {{"a", -1}}}}}}, "inner_loop.tensor_rates.a");
   expect_refused({{"inner_loop", {{"tensor_rates", 3}}}}, "inner_loop.tensor_rates");
   expect_refused({{"implicit_maml", {{"cg_tolerance", 2}}}}, "implicit_maml.cg_tolerance");
+  expect_refused({{"gaussian_prior", {{"rank", 2}}}}, "gaussian_prior.rank");
+  expect_refused({{"gaussian_prior", {{"covariance", "BLOCK"}, {"rank", 2}}}}, "gaussian_prior.rank");
+  expect_refused({{"gaussian_prior", {{"covariance", "LOW_RANK"}}}}, "gaussian_prior.rank");
+  expect_refused({{"gaussian_prior", {{"covariance", "DIAGONAL"}}}}, "gaussian_prior.covariance");
 }
 
 }  // namespace
