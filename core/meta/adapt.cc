@@ -10,6 +10,7 @@
 #include "core/meta/arx.h"
 #include "core/meta/fit_plan.h"
 #include "core/meta/inner_loop.h"
+#include "core/meta/proximal_fit.h"
 #include "core/nssm/loss.h"
 
 namespace metaekf::meta {
@@ -149,6 +150,7 @@ nssm::GaussianPrior ProximalPrior(const FitPlan& plan, double proximal) {
 struct Problem {
   nssm::LossSpec loss;
   double pull = 0;  // λ of what IMPLICIT_MAML minimises in training too
+  bool trained_at_minimum = false;  // by LEVENBERG_MARQUARDT
   nn::Mask mask;
   Trajectory context;  // found fit for adaptation
   Eigen::VectorXd from;  // unknowns of a fit to the head of the context, for Levenberg–Marquardt to go on from
@@ -202,10 +204,38 @@ absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const Pr
   return result;
 }
 
+/// The minimum that a model of IMPLICIT_MAML was trained with, in double whatever the model's precision.
+absl::StatusOr<FitResult> FitToMinimum(const Bundle& bundle, const Problem& problem, const Trajectory& context,
+                                       const AdaptationOptions& options, const OnStep& on_step) {
+  const nssm::RolloutLeastSquares least_squares(bundle.model, problem.loss, problem.mask, false);
+  METAEKF_ASSIGN_OR_RETURN(const nssm::LossData<double> data, least_squares.Cut(context));
+  nssm::RolloutLeastSquares::Workspace workspace(least_squares, data.shape);
+  const Eigen::VectorXd weights = VarianceOfLoss(least_squares, problem.loss, data).cwiseInverse();
+  const auto loss_at = [&](const std::vector<double>& parameters) {
+    return least_squares.Cost(parameters.data(), Eigen::VectorXd(), weights, data, &workspace);
+  };
+  FitResult result{.parameters = bundle.parameters, .loss_before = loss_at(bundle.parameters)};
+  if (!std::isfinite(result.loss_before)) {
+    return absl::OutOfRangeError("the adaptation diverged: the meta-learned parameters do not simulate this system");
+  }
+  const int32_t steps = options.inner_loop.steps;
+  const auto tell = [&](int step, double cost) { return !on_step || on_step({.step = step, .steps = steps, .loss = cost}); };
+  const MapFit fit = FitProximal(least_squares, problem.loss, data, bundle.parameters,
+                                 {.proximal = problem.pull, .steps = steps}, &workspace, tell);
+  if (fit.stopped) return absl::CancelledError("the adaptation was cancelled");
+  ScatterAdapted(least_squares, fit.unknowns, &result.parameters);
+  nssm::RoundToPrecision(bundle.model.spec().precision, &result.parameters);
+  result.loss_after = loss_at(result.parameters);
+  return result;
+}
+
 absl::StatusOr<FitResult> FitAnyPrecision(const Bundle& bundle, const Problem& problem, const Trajectory& context,
                                           const AdaptationOptions& options, const OnStep& on_step,
                                           const Inspect& inspect = nullptr) {
   METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, context));
+  if (options.method == AdaptationMethod::kLevenbergMarquardt && problem.trained_at_minimum) {
+    return FitToMinimum(bundle, problem, normalised, options, on_step);
+  }
   if (options.method == AdaptationMethod::kLevenbergMarquardt || bundle.model.spec().fits_start()) {
     return FitByLevenbergMarquardt(bundle, problem, normalised, options, on_step);
   }
@@ -258,6 +288,7 @@ absl::StatusOr<Problem> Pose(const Bundle& bundle, const Trajectory& context, co
   METAEKF_RETURN_IF_ERROR(CheckTensorRates(options.inner_loop, bundle.model.layout()));
   if (training.algorithm == Algorithm::kImplicitMaml && options.method != AdaptationMethod::kFromScratch) {
     problem.pull = options.inner_loop.proximal;
+    problem.trained_at_minimum = training.inner_loop.optimiser == Optimiser::kLevenbergMarquardt;
   }
   if (spec.is_case_one()) problem.context.states.resize(0, context.length());
   return problem;

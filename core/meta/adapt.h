@@ -16,7 +16,9 @@ enum class AdaptationMethod {
   kGradientDescent,  ///< eq. maml_inner from the meta-learned parameters
   kAdam,             ///< the same loss and start, Adam steps
   kFromScratch,      ///< Adam from a random initialisation: the supervised baseline
-  kLevenbergMarquardt,  ///< the most probable parameters under the model's prior (FitSystem)
+  /// The most probable parameters under the model's prior (FitSystem); of a model that IMPLICIT_MAML has trained with this
+  /// optimiser the minimum that it was trained with (FitProximal).
+  kLevenbergMarquardt,
 };
 
 struct AdaptationOptions {
@@ -46,7 +48,8 @@ struct AdaptationResult {
   double context_loss_after = 0;
   int64_t tail_samples = 0;        ///< held out for the errors below
   TailErrors before, after, arx;
-  std::optional<nssm::GaussianPosterior> posterior;  ///< kLevenbergMarquardt; of the tensors of `mask`
+  /// kLevenbergMarquardt; of the tensors of `mask`. None of IMPLICIT_MAML's minimum, whose loss is no likelihood.
+  std::optional<nssm::GaussianPosterior> posterior;
 };
 
 /// Whether `a` is better than `b` in free run, all outputs together (geometric mean of the ratios, for outputs may have

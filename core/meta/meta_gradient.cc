@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 namespace metaekf::meta {
 
@@ -9,6 +10,9 @@ using nssm::LossData;
 using nssm::LossShape;
 
 namespace {
+
+constexpr int kSettlingSteps = 10;  // of Newton, at most
+constexpr double kSettled = 0.25;   // of the last squared slope: one that falls no further is down to rounding
 
 nn::Mask AllOf(const nssm::Model& model) { return nn::Mask(model.layout().tensors().size(), true); }
 
@@ -23,6 +27,22 @@ InnerLoop<T> MakeLoop(const nssm::Model& model, const TrainingSpec& spec, const 
   const int32_t steps = spec.algorithm == Algorithm::kSupervised ? 0 : spec.inner_loop.steps;
   const double pull = spec.algorithm == Algorithm::kImplicitMaml ? spec.inner_loop.proximal : 0;
   return InnerLoop<T>(model.layout(), adapted, spec.inner_loop.optimiser, steps, pull, RecordFor(spec));
+}
+
+bool GoesToMinimum(const TrainingSpec& spec) {
+  return spec.algorithm == Algorithm::kImplicitMaml && spec.inner_loop.optimiser == Optimiser::kLevenbergMarquardt;
+}
+
+template <typename T>
+LossData<double> InDouble(const LossData<T>& data) {
+  const auto copy = [](const std::vector<T>& values) { return std::vector<double>(values.begin(), values.end()); };
+  return {.shape = data.shape,
+          .start = copy(data.start),
+          .first_input = copy(data.first_input),
+          .inputs = copy(data.inputs),
+          .states = copy(data.states),
+          .outputs = copy(data.outputs),
+          .first_output = copy(data.first_output)};
 }
 
 std::vector<double> RatesOfAdapted(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& adapted) {
@@ -45,9 +65,15 @@ MetaGradient<T>::MetaGradient(const nssm::Model& model, const TrainingSpec& spec
       rates_(RatesOfAdapted(spec, model, adapted)),
       loop_(MakeLoop<T>(model, spec, adapted)),
       implicit_(model.layout(), adapted, spec.inner_loop.proximal, spec.implicit_maml),
+      loss_(spec.loss),
+      steps_(spec.inner_loop.steps),
+      proximal_(spec.inner_loop.proximal),
+      tolerance_(spec.implicit_maml.cg_tolerance),
       inner_(model, spec.loss, context, adapted, adapted),
       outer_(model, spec.loss, context, AllOf(model), adapted),
-      target_(model, spec.loss, target, AllOf(model), adapted) {}
+      target_(model, spec.loss, target, AllOf(model), adapted) {
+  if (GoesToMinimum(spec)) least_squares_.emplace(model, spec.loss, adapted, false);
+}
 
 template <typename T>
 MetaGradient<T>::Scratch::Scratch(const MetaGradient& owner)
@@ -58,7 +84,11 @@ MetaGradient<T>::Scratch::Scratch(const MetaGradient& owner)
       rate_adjoints_(owner.rates_.size()),
       inner_(owner.inner_.MakeScratch()),
       outer_(owner.outer_.MakeScratch()),
-      target_(owner.target_.MakeScratch()) {}
+      target_(owner.target_.MakeScratch()) {
+  if (!owner.least_squares_) return;
+  least_squares_ = std::make_unique<nssm::RolloutLeastSquares::Workspace>(*owner.least_squares_, owner.inner_.shape());
+  for (auto* vector : {&minimum_, &last_, &step_}) vector->resize(static_cast<size_t>(owner.size_));
+}
 
 template <typename T>
 size_t MetaGradient<T>::variables() const {
@@ -74,9 +104,46 @@ void MetaGradient<T>::ReadRates(const T* variables, Scratch* scratch) const {
 
 template <typename T>
 const T* MetaGradient<T>::Adapt(const T* variables, const LossData<T>& context, Scratch* scratch) const {
+  if (least_squares_) return Minimum(variables, context, scratch);
   ReadRates(variables, scratch);
   const auto gradient = [&](const T* at, T* result) { inner_.Gradient(at, context, result, scratch->inner_); };
   return loop_.Run(variables, scratch->rates_, gradient, &scratch->trace_);
+}
+
+template <typename T>
+const T* MetaGradient<T>::Minimum(const T* start, const LossData<T>& context, Scratch* scratch) const {
+  std::vector<double> parameters(start, start + size_);
+  const MapFit fit = FitProximal(*least_squares_, loss_, InDouble(context), parameters,
+                                 {.proximal = proximal_, .steps = steps_}, scratch->least_squares_.get());
+  ScatterAdapted(*least_squares_, fit.unknowns, &parameters);
+  scratch->minimum_.assign(parameters.begin(), parameters.end());
+  if (fit.converged) Settle(start, context, scratch);
+  return scratch->minimum_.data();
+}
+
+template <typename T>
+void MetaGradient<T>::Settle(const T* start, const LossData<T>& context, Scratch* scratch) const {
+  std::vector<T>&at = scratch->minimum_, &step = scratch->step_, &last = scratch->last_;
+  const auto hessian_vector = [&](const T* v, T* product) {
+    inner_.HessianVector(at.data(), context, v, product, scratch->inner_);
+  };
+  double last_slope = std::numeric_limits<double>::infinity();
+  for (int i = 0; i <= kSettlingSteps; ++i) {
+    inner_.Gradient(at.data(), context, step.data(), scratch->inner_);
+    double slope = 0, pull = 0;
+    for (size_t k = 0; k < at.size(); ++k) {
+      const double pulled = proximal_ * (static_cast<double>(at[k]) - static_cast<double>(start[k]));
+      step[k] = static_cast<T>(step[k] + pulled);
+      slope += static_cast<double>(step[k]) * static_cast<double>(step[k]);
+      pull += pulled * pulled;
+    }
+    if (i > 0 && !(slope < last_slope)) at = last;
+    if (!(slope < kSettled * last_slope) || slope <= tolerance_ * tolerance_ * pull || i == kSettlingSteps) break;
+    last_slope = slope;
+    last = at;
+    implicit_.Apply(hessian_vector, step.data(), &scratch->implicit_);
+    for (size_t k = 0; k < at.size(); ++k) at[k] = static_cast<T>(at[k] - step[k] / proximal_);
+  }
 }
 
 template <typename T>

@@ -1,9 +1,12 @@
 #pragma once
 
+#include <memory>
+#include <optional>
 #include <vector>
 
 #include "core/meta/implicit_gradient.h"
 #include "core/meta/inner_loop.h"
+#include "core/meta/proximal_fit.h"
 #include "core/meta/training_spec.h"
 #include "core/nssm/loss.h"
 
@@ -18,6 +21,9 @@ namespace metaekf::meta {
 ///                          (ImplicitGradient)
 ///   REPTILE            g = d_1 + … + d_M of an inner loop on 𝓒 ∪ 𝓣 = (ω₀ − ω_M)/β;  of parameters that do not adapt the
 ///                          sum of their gradients ∇L(𝓒 ∪ 𝓣; ω_{m−1}) on the way
+///
+/// With LEVENBERG_MARQUARDT for optimiser IMPLICIT_MAML does not take ω_M for the minimum, it goes there: by FitProximal, in
+/// double whatever T, then by Newton steps with the exact Hessian until ∇L + λ (ω − ω₀) is `cg_tolerance` of λ |ω − ω₀|.
 ///
 /// L(𝓒 ∪ 𝓣) is the mean of both losses by the number of samples that each predicts. With one step of gradient descent
 /// Reptile's is the plain gradient of L(𝓒 ∪ 𝓣; ω₀), for every parameter.
@@ -45,6 +51,8 @@ class MetaGradient {
     typename InnerLoop<T>::Trace trace_;
     typename ImplicitGradient<T>::Scratch implicit_;
     std::vector<T> target_gradient_;
+    std::unique_ptr<nssm::RolloutLeastSquares::Workspace> least_squares_;
+    std::vector<T> minimum_, last_, step_;  // of Minimum and Settle
     std::vector<double> rates_, rate_adjoints_;
     typename nssm::LossFunction<T>::Scratch inner_, outer_, target_;
   };
@@ -62,6 +70,10 @@ class MetaGradient {
 
  private:
   void ReadRates(const T* variables, Scratch* scratch) const;
+  /// argmin L(𝓒; ω) + ½ λ |ω − ω₀|² by Levenberg–Marquardt. @return inside the scratch.
+  const T* Minimum(const T* start, const nssm::LossData<T>& context, Scratch* scratch) const;
+  /// Newton steps from what least squares have found: their costs do not tell points 1e-8 apart, gradients do.
+  void Settle(const T* start, const nssm::LossData<T>& context, Scratch* scratch) const;
   /// @return ω_M.
   const T* Adapt(const T* variables, const nssm::LossData<T>& context, Scratch* scratch) const;
   double Reptile(const T* variables, const nssm::LossData<T>& context, const nssm::LossData<T>& target, T* gradient,
@@ -75,6 +87,10 @@ class MetaGradient {
   std::vector<double> rates_;  // of the adapted tensors, unless they are learned
   InnerLoop<T> loop_;
   ImplicitGradient<T> implicit_;
+  nssm::LossSpec loss_;
+  int32_t steps_;
+  double proximal_, tolerance_;
+  std::optional<nssm::RolloutLeastSquares> least_squares_;  // of Minimum
   nssm::LossFunction<T> inner_;   // on the context set, adapted parameters only
   nssm::LossFunction<T> outer_;   // on the context set, all parameters; all rows of H P
   nssm::LossFunction<T> target_;  // on the target set, all parameters

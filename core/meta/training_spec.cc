@@ -102,7 +102,13 @@ ImplicitMamlSpec ReadImplicitMaml(JsonFields* parent) {
 void CheckInnerLoop(const TrainingSpec& spec, JsonFields* fields) {
   const InnerLoopSpec& inner = spec.inner_loop;
   if (inner.optimiser == Optimiser::kLevenbergMarquardt) {
-    fields->Fail("inner_loop.optimiser", "LEVENBERG_MARQUARDT is for adaptation; GRADIENT_DESCENT and ADAM train");
+    if (spec.algorithm != Algorithm::kImplicitMaml) {
+      fields->Fail("inner_loop.optimiser",
+                   "LEVENBERG_MARQUARDT is for IMPLICIT_MAML and for adaptation; its steps are not differentiated");
+    } else if (spec.loss.reconstruction_weight > 0) {
+      fields->Fail("loss.reconstruction_weight",
+                   "must be 0 with inner_loop.optimiser LEVENBERG_MARQUARDT, which fits rollouts alone");
+    }
   }
   if (inner.learned_rates && spec.algorithm != Algorithm::kMaml && spec.algorithm != Algorithm::kFirstOrderMaml) {
     fields->Fail("inner_loop.learned_rates", "only MAML and FIRST_ORDER_MAML have a gradient for the rates");

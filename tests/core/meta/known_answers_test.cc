@@ -10,6 +10,7 @@
 #include <Eigen/Eigenvalues>
 #include <cmath>
 
+#include "core/base/numbers.h"
 #include "core/meta/adam.h"
 #include "core/meta/meta_gradient.h"
 #include "tests/core/nssm/random_models.h"
@@ -154,6 +155,24 @@ TEST_F(KnownAnswersTest, ImplicitMamlIsTheInverseOfOnePlusHessianOverLambdaTimes
     const VectorXd minimum = (of_context_.A + lambda * identity).ldlt().solve(of_context_.b + lambda * Theta(parameters_));
     ExpectClose(MetaGradientOfTheta(), (identity + of_context_.A / lambda).ldlt().solve(of_target_.Gradient(minimum)), 1e-9);
   }
+}
+
+TEST_F(KnownAnswersTest, ImplicitMamlByLevenbergMarquardtIsAtThatMinimumAfterAFewSteps) {
+  double worst = 0;
+  for (const double lambda : {0.05, 1.0, 30.0}) {
+    spec_.algorithm = Algorithm::kImplicitMaml;
+    spec_.inner_loop.optimiser = Optimiser::kLevenbergMarquardt;
+    spec_.inner_loop.proximal = lambda;
+    spec_.inner_loop.steps = 12;
+    spec_.implicit_maml = {.cg_steps = 4, .cg_tolerance = 0};
+    const MatrixXd identity = MatrixXd::Identity(4, 4);
+    const VectorXd minimum = (of_context_.A + lambda * identity).ldlt().solve(of_context_.b + lambda * Theta(parameters_));
+    const VectorXd expected = (identity + of_context_.A / lambda).ldlt().solve(of_target_.Gradient(minimum));
+    const VectorXd actual = MetaGradientOfTheta();
+    ExpectClose(actual, expected, 1e-9);
+    worst = std::max(worst, (actual - expected).norm() / expected.norm());
+  }
+  RecordProperty("worst", base::FormatShort(worst));
 }
 
 TEST_F(KnownAnswersTest, ImplicitMamlOfAnInfinitePullIsThePlainGradientInEveryParameter) {

@@ -140,6 +140,23 @@ TEST(MetaGradientTest, TheImplicitGradientMatchesCentralDifferencesOfTheMinimum)
   RecordProperty("worst", base::FormatShort(worst));
 }
 
+// The differences are those of the whole way: fit, Newton steps, loss of the target set.
+TEST(MetaGradientTest, TheImplicitGradientAtALeastSquaresMinimumMatchesCentralDifferences) {
+  double worst = 0;
+  for (const auto& [index, mask] : {std::pair{0, "encoder.0,transition"}, {1, "*"}, {2, "*_decoder"}, {5, "*"}}) {
+    ModelCase c = nssm::ModelCases()[static_cast<size_t>(index)];
+    c.loss.reconstruction_weight = 0;
+    TrainingSpec spec = Spec(c, Algorithm::kImplicitMaml, 60, 0);
+    spec.inner_loop.optimiser = Optimiser::kLevenbergMarquardt;
+    spec.inner_loop.proximal = 2;
+    spec.implicit_maml = {.cg_steps = 300, .cg_tolerance = 1e-13};
+    const double error = RelativeErrorAgainstDifferences(c, mask, spec, 1e-3);
+    EXPECT_LT(error, 1e-6) << c.name << ", mask " << mask;
+    worst = std::max(worst, error);
+  }
+  RecordProperty("worst", base::FormatShort(worst));
+}
+
 TEST(MetaGradientTest, FirstOrderRatesTakeTheDirectionsForConstants) {
   const ModelCase c = nssm::ModelCases().front();
   const Task task = MakeTask(c);

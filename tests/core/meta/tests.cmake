@@ -9,5 +9,6 @@ metaekf_test(core/meta/meta_gradient_test.cc TIMEOUT 600 DEPS metaekf::core_meta
 metaekf_test(core/meta/meta_memory_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/output_error_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/polynomial_narx_test.cc DEPS metaekf::core_meta)
+metaekf_test(core/meta/proximal_fit_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/train_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/training_spec_test.cc DEPS metaekf::core_meta)

@@ -89,6 +89,11 @@ std::vector<Variant> Variants() {
   }
   add("FirstOrderMaml", Algorithm::kFirstOrderMaml, Optimiser::kGradientDescent, false);
   add("Supervised", Algorithm::kSupervised, Optimiser::kGradientDescent, false);
+  add("ImplicitMamlByLevenbergMarquardt", Algorithm::kImplicitMaml, Optimiser::kLevenbergMarquardt, false);
+  TrainingSpec& by_least_squares = variants.back().spec;
+  by_least_squares.loss.reconstruction_weight = 0;
+  by_least_squares.inner_loop.proximal = by_least_squares.adaptation.proximal = 0.3;
+  by_least_squares.inner_loop.steps = by_least_squares.adaptation.steps = 12;
   return variants;
 }
 
@@ -175,6 +180,38 @@ TEST(TrainTest, AModelOfImplicitMamlIsPulledToItsStartAtAdaptationToo) {
   };
   EXPECT_LT(distance(1e12), 1e-10);
   EXPECT_LT(distance(10), distance(0.1));
+}
+
+// The minimum that adaptation goes to is that of descent with the same pull, which takes thousands of steps there.
+TEST(TrainTest, AModelOfImplicitMamlByLevenbergMarquardtAdaptsToTheMinimumItWasTrainedWith) {
+  TrainingSpec spec = SmallSpec();
+  spec.algorithm = Algorithm::kImplicitMaml;
+  spec.inner_loop = spec.adaptation = {
+      .steps = 30, .adapted_mask = "transition", .optimiser = Optimiser::kLevenbergMarquardt, .proximal = 0.3};
+  spec.loss.reconstruction_weight = 0;
+  const auto executor = base::MakeSerialExecutor();
+  const nssm::Bundle bundle = *Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), nullptr);
+  const Trajectory system = Fleet(1, 60, 3).trajectories[0];
+  const AdaptationOptions options = *DefaultAdaptation(bundle);
+  EXPECT_EQ(options.method, AdaptationMethod::kLevenbergMarquardt);
+  int told = 0;
+  const absl::StatusOr<AdaptationResult> result = Adapt(bundle, system, options, [&](const AdaptationStep&) { return ++told > 0; });
+  ASSERT_TRUE(result.ok()) << result.status();
+  EXPECT_GT(told, 4);
+  EXPECT_LT(result->context_loss_after, result->context_loss_before);
+  EXPECT_FALSE(result->posterior);
+  AdaptationOptions descent = *DefaultAdaptation(bundle, AdaptationMethod::kGradientDescent);
+  descent.inner_loop.steps = 5000;
+  descent.inner_loop.learning_rate = 0.05;
+  const std::vector<double> there = *AdaptedParameters(bundle, system, descent);
+  double way = 0, apart = 0;
+  for (size_t i = 0; i < there.size(); ++i) {
+    way += std::pow(there[i] - bundle.parameters[i], 2);
+    apart += std::pow(there[i] - result->parameters[i], 2);
+  }
+  EXPECT_LT(std::sqrt(apart / way), 1e-3);
+  const absl::Status stopped = Adapt(bundle, system, options, [](const AdaptationStep&) { return false; }).status();
+  EXPECT_EQ(stopped.code(), absl::StatusCode::kCancelled);
 }
 
 TEST(TrainTest, ATrainingThatDivergesSaysSoAndLeavesItsLastGoodState) {

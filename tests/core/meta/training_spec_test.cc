@@ -32,6 +32,15 @@ TEST(TrainingSpecTest, WhatIsWrittenReadsBack) {
   EXPECT_EQ(ToJson(*ReadTrainingSpec(ToJson(*read))), ToJson(*read));
 }
 
+TEST(TrainingSpecTest, ImplicitMamlTakesLevenbergMarquardtAndSoDoesItsAdaptation) {
+  const json inner = {{"optimiser", "LEVENBERG_MARQUARDT"}, {"steps", 20}, {"proximal", 0.5}};
+  const auto spec = ReadTrainingSpec(WithModel({{"algorithm", "IMPLICIT_MAML"}, {"inner_loop", inner}}));
+  ASSERT_TRUE(spec.ok()) << spec.status();
+  EXPECT_EQ(spec->adaptation.optimiser, Optimiser::kLevenbergMarquardt);
+  EXPECT_EQ(spec->adaptation.steps, 20);
+  EXPECT_EQ(spec->adaptation.proximal, 0.5);
+}
+
 TEST(TrainingSpecTest, EveryStructureOfAPriorsCovarianceIsReadAndWritten) {
   for (const auto& [name, rank] : {std::pair{"FULL", 0}, {"LOW_RANK", 3}, {"BLOCK", 0}}) {
     const auto spec = ReadTrainingSpec(WithModel({{"gaussian_prior", {{"covariance", name}, {"rank", rank}}}}));
@@ -62,7 +71,12 @@ TEST(TrainingSpecTest, WhatAnAlgorithmCannotUseIsRefusedByName) {
   expect_refused({{"algorithm", "REPTILE"}, {"inner_loop", learned}}, "inner_loop.learned_rates");
   expect_refused({{"algorithm", "REPTILE"}, {"inner_loop", {{"steps", 0}}}}, "inner_loop.steps");
   expect_refused({{"algorithm", "IMPLICIT_MAML"}, {"inner_loop", {{"proximal", 0}}}}, "inner_loop.proximal");
-  expect_refused({{"inner_loop", {{"optimiser", "LEVENBERG_MARQUARDT"}}}}, "inner_loop.optimiser");
+  const json least_squares = {{"optimiser", "LEVENBERG_MARQUARDT"}};
+  for (const char* name : {"MAML", "FIRST_ORDER_MAML", "SUPERVISED", "GAUSSIAN_PRIOR", "REPTILE"}) {
+    expect_refused({{"algorithm", name}, {"inner_loop", least_squares}}, "inner_loop.optimiser");
+  }
+  expect_refused({{"algorithm", "IMPLICIT_MAML"}, {"inner_loop", least_squares}, {"loss", {{"reconstruction_weight", 0.5}}}},
+                 "loss.reconstruction_weight");
   expect_refused({{"inner_loop", {{"learned_rates", true}, {"learning_rate", 0}}}}, "inner_loop.learning_rate");
   expect_refused({{"inner_loop", {{"tensor_rates", {{"a", -1}}}}}}, "inner_loop.tensor_rates.a");
   expect_refused({{"inner_loop", {{"tensor_rates", 3}}}}, "inner_loop.tensor_rates");
