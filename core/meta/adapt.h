@@ -56,7 +56,8 @@ struct AdaptationResult {
 /// different units). What did not diverge is better than what did, or is not there.
 bool BetterInFreeRun(const TailErrors& a, const TailErrors& b);
 
-/// The adaptation alone: ω_M from the whole context, without errors on a tail. Arguments and errors as those of Adapt.
+/// The adaptation alone: ω_M from the whole context, all steps, without errors on a tail. Arguments and errors as those of
+/// Adapt.
 absl::StatusOr<std::vector<double>> AdaptedParameters(const nssm::Bundle& bundle, const data::Trajectory& context,
                                                       const AdaptationOptions& options);
 
