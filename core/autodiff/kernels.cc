@@ -1,16 +1,11 @@
 #include "core/autodiff/kernels.h"
 
-#include <cblas.h>
+#include "core/linalg/blas.h"
 
 namespace metaekf::autodiff {
 namespace {
 
 constexpr int64_t kSmallProduct = 4096;  // multiplications below which plain loops win
-
-[[maybe_unused]] const bool kSingleThreaded = [] {
-  openblas_set_num_threads(1);
-  return true;
-}();
 
 void LibraryMatMul(CBLAS_TRANSPOSE ta, CBLAS_TRANSPOSE tb, int m, int n, int k, const float* a, int lda, const float* b,
                    int ldb, float beta, float* c, int ldc) {

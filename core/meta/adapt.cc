@@ -1,11 +1,11 @@
 #include "core/meta/adapt.h"
 
-#include <Eigen/Cholesky>
 #include <cmath>
 
 #include "core/base/numbers.h"
 #include "core/base/status.h"
 #include "core/data/split.h"
+#include "core/linalg/decompositions.h"
 #include "core/meta/adam.h"
 #include "core/meta/arx.h"
 #include "core/meta/fit_plan.h"
@@ -34,6 +34,7 @@ constexpr double kScratchLearningRate = 3e-3;
 constexpr double kAdamLearningRate = 1e-3;
 constexpr int32_t kLevenbergMarquardtSteps = 60;
 constexpr double kUnknownNoiseVariance = 1e-2;  // normalised units
+constexpr double kTrialTolerance = 1e-3;        // the last tenths of a per cent do not show in errors on a tail
 
 absl::Status CheckFinite(const std::string& signal, const Eigen::MatrixXd& values) {
   for (Eigen::Index t = 0; t < values.cols(); ++t) {
@@ -153,9 +154,10 @@ struct Problem {
   bool trained_at_minimum = false;  // by LEVENBERG_MARQUARDT
   nn::Mask mask;
   Trajectory context;  // found fit for adaptation
-  Eigen::VectorXd from;  // unknowns of a fit to the head of the context, for Levenberg–Marquardt to go on from
+  // Of Levenberg–Marquardt: when it ends, and unknowns of a fit to the head of the context to go on from.
+  double tolerance = SystemFitOptions().tolerance;
+  Eigen::VectorXd from;
 };
-
 
 /// What the information about [ω; c₀] says of ω: the Schur complement integrates c₀ out.
 nssm::GaussianPosterior PosteriorOf(const Eigen::MatrixXd& information, Eigen::Index adapted) {
@@ -163,7 +165,7 @@ nssm::GaussianPosterior PosteriorOf(const Eigen::MatrixXd& information, Eigen::I
   nssm::GaussianPosterior posterior{information.topLeftCorner(adapted, adapted)};
   if (starts == 0) return posterior;
   const auto cross = information.bottomLeftCorner(starts, adapted);
-  posterior.information -= cross.transpose() * information.bottomRightCorner(starts, starts).llt().solve(cross);
+  posterior.information -= cross.transpose() * linalg::Cholesky(information.bottomRightCorner(starts, starts)).Solve(Eigen::MatrixXd(cross));
   return posterior;
 }
 
@@ -187,7 +189,7 @@ absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const Pr
   METAEKF_ASSIGN_OR_RETURN(
       SystemFit fit, options.method == AdaptationMethod::kFromScratch
                          ? FitFromScratch(plan, bundle.model, problem.loss, context, {.seed = options.seed, .steps = steps}, tell)
-                         : FitSystem(plan, prior, bundle.parameters, context, {.steps = steps, .from = problem.from}, tell));
+                         : FitSystem(plan, prior, bundle.parameters, context, {.steps = steps, .tolerance = problem.tolerance, .from = problem.from}, tell));
   if (stopped) return absl::CancelledError("the adaptation was cancelled");
   FitResult result{.parameters = std::move(fit.parameters),
                    .posterior = PosteriorOf(fit.fit.information, plan.dynamics.adapted_size()),
@@ -410,6 +412,7 @@ absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& c
   METAEKF_ASSIGN_OR_RETURN(const Trajectory tail, data::SamplesFrom(problem.context, held_out_from));
 
   METAEKF_ASSIGN_OR_RETURN(result.before, ErrorsOf(bundle, tail));
+  problem.tolerance = kTrialTolerance;
   const OnStep on_trial_step = [&](AdaptationStep step) {
     step.trial = true;
     return !on_step || on_step(step);
@@ -421,6 +424,7 @@ absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& c
   AdaptationOptions whole = options;
   whole.inner_loop.steps = result.steps = trial.steps;
   problem.from = std::move(trial.unknowns);
+  problem.tolerance = SystemFitOptions().tolerance;
   METAEKF_ASSIGN_OR_RETURN(FitResult fit, FitAnyPrecision(bundle, problem, problem.context, whole, on_step));
   result.parameters = std::move(fit.parameters);
   result.posterior = std::move(fit.posterior);

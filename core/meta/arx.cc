@@ -1,10 +1,11 @@
 #include "core/meta/arx.h"
 
-#include <Eigen/QR>
 #include <algorithm>
 #include <limits>
+#include <utility>
 
 #include "absl/strings/str_cat.h"
+#include "core/linalg/decompositions.h"
 
 namespace metaekf::meta {
 
@@ -42,7 +43,7 @@ absl::StatusOr<ArxModel> ArxModel::Fit(const data::Trajectory& trajectory, int o
   scale = (scale.array() > 0).select(scale, 1.0);
   regressors *= scale.cwiseInverse().asDiagonal();
   const MatrixXd targets = trajectory.outputs.rightCols(rows).transpose();
-  const MatrixXd solution = regressors.completeOrthogonalDecomposition().solve(targets);
+  const MatrixXd solution = linalg::SolveLeastSquares(std::move(regressors), targets);
   model.coefficients_ = (scale.cwiseInverse().asDiagonal() * solution).transpose();
   return model;
 }

@@ -1,11 +1,10 @@
 #include "core/meta/covariance_structure.h"
 
-#include <Eigen/Cholesky>
-#include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
 
 #include "absl/strings/str_cat.h"
+#include "core/linalg/decompositions.h"
 
 namespace metaekf::meta {
 
@@ -22,12 +21,12 @@ double UpdateLoadings(const MatrixXd& second_moment, FactorModel* model) {
   const Index p = second_moment.rows(), rank = model->loadings.cols();
   const VectorXd root = model->diagonal.cwiseSqrt(), inverse_root = root.cwiseInverse();
   const MatrixXd scaled = inverse_root.asDiagonal() * second_moment * inverse_root.asDiagonal();
-  const Eigen::SelfAdjointEigenSolver<MatrixXd> eigen(scaled);
+  const linalg::SymmetricEigen eigen = linalg::DecomposeSymmetric(scaled);
   double twice_negative = model->diagonal.array().log().sum();
   for (Index i = 0; i < p; ++i) {  // from the largest on
-    const double theta = eigen.eigenvalues()[p - 1 - i];
+    const double theta = eigen.values[p - 1 - i];
     const double excess = i < rank ? std::max(theta - 1, 0.0) : 0;
-    if (i < rank) model->loadings.col(i) = std::sqrt(excess) * root.cwiseProduct(eigen.eigenvectors().col(p - 1 - i));
+    if (i < rank) model->loadings.col(i) = std::sqrt(excess) * root.cwiseProduct(eigen.vectors.col(p - 1 - i));
     twice_negative += excess > 0 ? std::log(theta) + 1 : theta;
   }
   return -0.5 * twice_negative;
@@ -72,7 +71,7 @@ MatrixXd FactorModel::Precision() const {
   const MatrixXd scaled = diagonal.cwiseInverse().asDiagonal() * loadings;
   const Index rank = loadings.cols();
   const MatrixXd inner = MatrixXd::Identity(rank, rank) + loadings.transpose() * scaled;
-  MatrixXd precision = -scaled * inner.llt().solve(scaled.transpose());
+  MatrixXd precision = -scaled * linalg::Cholesky(inner).Solve(MatrixXd(scaled.transpose()));
   precision.diagonal() += diagonal.cwiseInverse();
   return precision;
 }

@@ -1,6 +1,5 @@
 #include "core/meta/empirical_bayes.h"
 
-#include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -8,6 +7,7 @@
 
 #include "core/base/status.h"
 #include "core/data/split.h"
+#include "core/linalg/decompositions.h"
 #include "core/meta/covariance_structure.h"
 #include "core/meta/fit_plan.h"
 
@@ -28,10 +28,6 @@ constexpr double kStalled = 6;            // times the median mean square of the
 constexpr size_t kBatch = 8;              // systems between two calls of on_step
 constexpr Index kGuessStride = 5;         // samples between windows of the regression for the start
 constexpr double kGuessRidge = 1e-8;
-
-MatrixXd Inverse(const MatrixXd& positive_definite) {
-  return positive_definite.llt().solve(MatrixXd::Identity(positive_definite.rows(), positive_definite.cols()));
-}
 
 double Median(std::vector<double> values) {
   std::nth_element(values.begin(), values.begin() + static_cast<Index>(values.size() / 2), values.end());
@@ -166,7 +162,7 @@ class Learner {
                             workspaces_[slot].For(plan_.dynamics, data_[s].shape));
         const MapFit& fit = found.ok() && !(own.cost <= found->fit.cost) ? found->fit : own;
         population_.fits[s] = fit.unknowns;
-        covariances[s] = Inverse(fit.information);
+        covariances[s] = linalg::Cholesky(fit.information).Inverse();
         const double samples = static_cast<double>(Samples(data_[s]));
         const double determined =
             static_cast<double>(fit.unknowns.size()) - (covariances[s] * belief.precision).trace();
@@ -209,7 +205,7 @@ class Learner {
         StructuredCovariance(options_, plan_.dynamics.adapted(), covariance.topLeftCorner(adapted, adapted));
     Belief& belief = population->belief;
     belief.mean = mean;
-    belief.precision = Inverse(covariance);
+    belief.precision = linalg::Cholesky(covariance).Inverse();
     for (Index c = 0; c < belief.noise_variance.size(); ++c) {
       if (!std::isfinite(belief.noise_variance[c])) continue;
       std::vector<double> of_channel;
@@ -313,7 +309,7 @@ class Learner {
       }
     }
     gram.diagonal().array() += kGuessRidge * gram.diagonal().mean();
-    best_.prior.start_guess = gram.selfadjointView<Eigen::Lower>().llt().solve(products).transpose();
+    best_.prior.start_guess = linalg::Cholesky(gram).Solve(products).transpose();
   }
 
   // ---- checkpoints ----

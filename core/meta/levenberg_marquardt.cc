@@ -1,8 +1,10 @@
 #include "core/meta/levenberg_marquardt.h"
 
-#include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
+#include <utility>
+
+#include "core/linalg/decompositions.h"
 
 namespace metaekf::meta {
 
@@ -33,13 +35,13 @@ LevenbergMarquardtResult MinimiseLevenbergMarquardt(const Objective& objective, 
     const double floor = 1e-12 * model.curvature.diagonal().maxCoeff();
     const VectorXd scale = model.curvature.diagonal().cwiseMax(floor);
     damped.diagonal() += damping * scale;
-    const Eigen::LLT<MatrixXd> factor(damped);
-    if (factor.info() != Eigen::Success) {
+    const linalg::Cholesky factor(std::move(damped));
+    if (!factor.ok()) {
       damping *= growth;
       growth *= 2;
       continue;
     }
-    const VectorXd step = -factor.solve(model.gradient);
+    const VectorXd step = -factor.Solve(model.gradient);
     // Φ(x) − model(x + δ) = ½ δᵀ (μ D δ − g)
     const double promised = 0.5 * step.dot(damping * scale.cwiseProduct(step) - model.gradient);
     if (promised <= kNothing * options.tolerance * model.cost) {

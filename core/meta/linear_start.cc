@@ -1,15 +1,12 @@
 #include "core/meta/linear_start.h"
 
 
-#include <Eigen/Cholesky>
-#include <Eigen/Eigenvalues>
-#include <Eigen/QR>
-#include <Eigen/SVD>
 #include <algorithm>
 #include <cmath>
 
 #include "absl/strings/str_cat.h"
 #include "core/base/rng.h"
+#include "core/linalg/decompositions.h"
 
 namespace metaekf::meta {
 namespace {
@@ -38,7 +35,7 @@ std::vector<MatrixXd> ImpulseResponse(const data::Trajectory& recording, Index o
   }
   MatrixXd gram = phi * phi.transpose();
   gram.diagonal().array() += kArxRidge * gram.diagonal().mean();
-  const MatrixXd theta = gram.ldlt().solve(phi * y.rightCols(rows).transpose()).transpose();
+  const MatrixXd theta = linalg::SolveLeastSquares(gram, phi * y.rightCols(rows).transpose()).transpose();
   std::vector<MatrixXd> response;
   for (Index k = 0; k < count; ++k) {
     MatrixXd h = k <= order ? MatrixXd(theta.middleCols(order * n_y + k * n_u, n_u)) : MatrixXd::Zero(n_y, n_u);
@@ -87,14 +84,14 @@ absl::StatusOr<std::vector<double>> LinearStart(const nssm::Model& model, const 
     for (Index j = 0; j < half; ++j) hankel.block(i * n_y, j * n_u, n_y, n_u) = h[static_cast<size_t>(first + i + j)];
   }
   if (!hankel.allFinite()) return absl::FailedPreconditionError("the ARX model behind the linear start is unstable");
-  const Eigen::BDCSVD<MatrixXd> svd(hankel, Eigen::ComputeThinU | Eigen::ComputeThinV);
-  const VectorXd root = svd.singularValues().head(n).cwiseMax(1e-9 * svd.singularValues()[0]).cwiseSqrt();
-  const MatrixXd observability = svd.matrixU().leftCols(n) * root.asDiagonal();
-  const MatrixXd controllability = root.asDiagonal() * svd.matrixV().leftCols(n).transpose();
+  const linalg::SingularValues svd = linalg::DecomposeSingularValues(hankel);
+  const VectorXd root = svd.values.head(n).cwiseMax(1e-9 * svd.values[0]).cwiseSqrt();
+  const MatrixXd observability = svd.u.leftCols(n) * root.asDiagonal();
+  const MatrixXd controllability = root.asDiagonal() * svd.v.leftCols(n).transpose();
   const MatrixXd upper = observability.topRows((half - 1) * n_y), lower = observability.bottomRows((half - 1) * n_y);
-  MatrixXd transition = upper.colPivHouseholderQr().solve(lower);
+  MatrixXd transition = linalg::SolveLeastSquares(upper, lower);
   MatrixXd output = observability.topRows(n_y), input = controllability.leftCols(n_u);
-  const double radius = transition.eigenvalues().cwiseAbs().maxCoeff();
+  const double radius = linalg::Eigenvalues(transition).cwiseAbs().maxCoeff();
   if (radius > kLargestPole) transition *= kLargestPole / radius;
   // Slow modes, leaky integrators of the input: what the network will bend into memory.
   base::Rng rng(seed, 1);

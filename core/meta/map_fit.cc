@@ -1,8 +1,9 @@
 #include "core/meta/map_fit.h"
 
-#include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
+
+#include "core/linalg/decompositions.h"
 
 namespace metaekf::meta {
 
@@ -22,7 +23,7 @@ constexpr double kNoiseConverged = 0.05;  // relative change that ends them
 VectorXd EstimateNoise(const Belief& belief, const MapFit& fit, int64_t samples, double noise_samples) {
   const VectorXd start = belief.noise_variance;
   // γ = tr(I − (Λ + JᵀWJ)⁻¹ Λ)
-  const double undetermined = fit.information.llt().solve(belief.precision).trace();
+  const double undetermined = linalg::Cholesky(fit.information).Solve(belief.precision).trace();
   const double determined = static_cast<double>(fit.unknowns.size()) - undetermined;
   const double used_channels = static_cast<double>((start.array() < std::numeric_limits<double>::infinity()).count());
   const double share = determined / std::max(1.0, used_channels);  // of each channel

@@ -1,13 +1,12 @@
 #include "core/meta/output_error.h"
 
-#include <Eigen/Eigenvalues>
-#include <Eigen/QR>
 #include <algorithm>
 #include <complex>
 #include <limits>
 
 #include "absl/strings/str_cat.h"
 #include "core/base/status.h"
+#include "core/linalg/decompositions.h"
 #include "core/meta/arx.h"
 #include "core/meta/levenberg_marquardt.h"
 
@@ -56,7 +55,7 @@ class Recursion {
     const Recursion head(inputs_.leftCols(samples), static_cast<int>(order_));
     const VectorXd forced = head.Simulate(coefficients, VectorXd::Zero(order_));
     const MatrixXd free = head.Sensitivity(coefficients, forced).rightCols(order_);
-    return free.colPivHouseholderQr().solve(measured.head(samples) - forced);
+    return linalg::SolveLeastSquares(free, measured.head(samples) - forced);
   }
 
  private:
@@ -79,7 +78,7 @@ VectorXd Stabilised(const VectorXd& past) {
   MatrixXd companion = MatrixXd::Zero(n, n);
   companion.row(0) = past.transpose();
   companion.diagonal(-1).setOnes();
-  Eigen::VectorXcd poles = companion.eigenvalues();
+  Eigen::VectorXcd poles = linalg::Eigenvalues(companion);
   for (Index i = 0; i < n; ++i) {
     if (std::abs(poles[i]) > 1) poles[i] = 1.0 / std::conj(poles[i]);
     if (std::abs(poles[i]) > kLargestPole) poles[i] *= kLargestPole / std::abs(poles[i]);

@@ -1,10 +1,11 @@
 #include "core/meta/polynomial_narx.h"
 
-#include <Eigen/QR>
 #include <algorithm>
 #include <limits>
+#include <utility>
 
 #include "absl/strings/str_cat.h"
+#include "core/linalg/decompositions.h"
 
 namespace metaekf::meta {
 
@@ -115,7 +116,7 @@ absl::StatusOr<PolynomialNarxModel> PolynomialNarxModel::Fit(const data::Traject
   scale = (scale.array() > 0).select(scale, 1.0);
   matrix *= scale.cwiseInverse().asDiagonal();
   matrix.bottomRows(terms).diagonal().setConstant(std::sqrt(kRidge));
-  const MatrixXd solution = matrix.householderQr().solve(targets);
+  const MatrixXd solution = linalg::SolveLeastSquares(std::move(matrix), targets);
   model.coefficients_ = (scale.cwiseInverse().asDiagonal() * solution).transpose();
   return model;
 }

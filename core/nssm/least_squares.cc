@@ -1,13 +1,12 @@
 #include "core/nssm/least_squares.h"
 
-#include <cblas.h>
-
 #include <algorithm>
 #include <cmath>
 #include <limits>
 
 #include "core/autodiff/differentiate.h"
 #include "core/autodiff/per_column.h"
+#include "core/linalg/blas.h"
 #include "core/nssm/sensitivity.h"
 
 namespace metaekf::nssm {

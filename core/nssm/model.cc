@@ -1,10 +1,10 @@
 #include "core/nssm/model.h"
 
-#include <Eigen/QR>
 #include <cmath>
 
 #include "core/autodiff/scan.h"
 #include "core/base/status.h"
+#include "core/linalg/decompositions.h"
 #include "core/physics/curl_free.h"
 
 namespace metaekf::nssm {
@@ -59,7 +59,7 @@ void Model::StartWithExactReconstruction(std::span<double> parameters) const {
     return Eigen::Map<RowMajor>(nullptr, 0, 0);
   };
   const Eigen::MatrixXd from_state = weight("encoder.0.weight").leftCols(spec_.state_size);
-  weight("state_decoder.0.weight") = from_state.completeOrthogonalDecomposition().pseudoInverse();
+  weight("state_decoder.0.weight") = linalg::SolveLeastSquares(from_state, Eigen::MatrixXd::Identity(from_state.rows(), from_state.rows()));
 }
 
 std::vector<double> Model::InitialParameters(uint64_t seed) const {
