@@ -44,9 +44,13 @@ absl::StatusOr<double> CovariancesMib(nssm::ModelSpec model, const data::Dataset
 
 /// Outer steps of each phase, timed.
 absl::StatusOr<double> GradientSeconds(meta::TrainingSpec spec, const data::Dataset& fleet) {
-  const int32_t warmup = std::min(spec.warmup_iterations, kProbeSteps), all = spec.iterations;
-  const int32_t warmups = std::min(spec.warmup_iterations, all), mains = all - warmups;
+  const int32_t warmup = std::min(spec.warmup_iterations, kProbeSteps), others = spec.restarts - 1;
+  const int32_t all = spec.iterations, screening = spec.screening_iterations;
+  const int32_t warmups_each = std::min(spec.warmup_iterations, all), warmups_screening = std::min(spec.warmup_iterations, screening);
+  const int32_t warmups = warmups_each + others * warmups_screening;
+  const int32_t mains = all - warmups_each + others * (screening - warmups_screening);
   spec.warmup_iterations = warmup;
+  spec.restarts = 1;
   const int32_t probes = warmup + std::min(mains, kProbeSteps);
   spec.iterations = probes + 1;
   spec.validation_period = probes + 1;

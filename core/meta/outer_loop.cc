@@ -123,6 +123,44 @@ class Phase {
 /// Names in TrainingState::values.
 constexpr char kParameters[] = "parameters", kFirstMoment[] = "first_moment", kSecondMoment[] = "second_moment",
                kBest[] = "best_parameters", kFirstLoss[] = "first_loss";
+/// While starts are screened: the values of the best that has been, under their names behind this prefix, and its losses.
+constexpr char kScreened[] = "screened_", kScreenedLosses[] = "screened_losses";
+
+/// How the steps of the screening and of the training follow each other: start 0, start 1, …, the rest of the best one.
+class Schedule {
+ public:
+  explicit Schedule(const TrainingSpec& spec)
+      : restarts_(spec.restarts), screening_(spec.restarts > 1 ? spec.screening_iterations : 0), iterations_(spec.iterations) {}
+
+  int32_t steps() const { return iterations_ + (restarts_ - 1) * screening_; }
+  bool screens(int32_t step) const { return step < restarts_ * screening_; }
+  /// Whether a start has come to the end of its screening after so many steps.
+  bool ends_start(int32_t steps) const { return steps > 0 && screens(steps - 1) && steps % screening_ == 0; }
+  /// Of the start that a step of the screening is in.
+  int32_t start(int32_t step) const { return step / screening_; }
+  int32_t first_step(int32_t start) const { return start * screening_; }
+  /// Iteration of the training that a step is: each start goes through the same ones.
+  int32_t iteration(int32_t step) const { return screens(step) ? step % screening_ : step - (restarts_ - 1) * screening_; }
+  int32_t restarts() const { return restarts_; }
+
+ private:
+  int32_t restarts_, screening_, iterations_;
+};
+
+/// Variables of a start and all that the outer loop keeps beside them.
+std::map<std::string, std::vector<double>> FreshValues(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
+                                                       int32_t start) {
+  std::vector<double> variables = model.InitialParameters(spec.seed ^ (static_cast<uint64_t>(start) << 32));
+  if (spec.inner_loop.learned_rates) {
+    const std::vector<double> rates = RatesOfTensors(spec.inner_loop, model.layout());
+    for (size_t i = 0; i < mask.size(); ++i) {
+      if (mask[i]) variables.push_back(std::log(rates[i]));
+    }
+  }
+  nssm::RoundToPrecision(spec.model.precision, &variables);
+  const std::vector<double> zeros(variables.size());
+  return {{kParameters, variables}, {kFirstMoment, zeros}, {kSecondMoment, zeros}, {kBest, variables}, {kFirstLoss, {0}}};
+}
 
 absl::Status Diverged(const TrainingSpec& spec, int32_t iteration, double loss, double norm, const TrainingState& good) {
   std::string best;
@@ -155,54 +193,111 @@ class OuterLoop {
  public:
   OuterLoop(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask, const Systems& systems,
             base::Executor* executor, TrainingState* state)
-      : spec_(spec), systems_(systems), state_(state), main_(spec, model, mask, systems, executor) {
-    if (state->iteration < spec.warmup_iterations) warmup_.emplace(WarmupSpec(spec), model, mask, systems, executor);
+      : spec_(spec),
+        model_(model),
+        mask_(mask),
+        systems_(systems),
+        state_(state),
+        schedule_(spec),
+        main_(spec, model, mask, systems, executor) {
+    if (schedule_.iteration(state->iteration) < spec.warmup_iterations || schedule_.screens(state->iteration)) {
+      warmup_.emplace(WarmupSpec(spec), model, mask, systems, executor);
+    }
   }
 
   /// Errors: those of RunOuterLoop.
   absl::Status Run(const OnTrainingStep& on_step) {
-    while (state_->iteration < spec_.iterations) {
-      const absl::Status stepped = Step();
-      if (!stepped.ok()) {
-        if (on_step) on_step({.state = *state_, .iterations = spec_.iterations, .diverged = true});
+    while (true) {
+      const int32_t step = state_->iteration, iteration = schedule_.iteration(step);
+      // Not before: a checkpoint of this step is that of the start which has just ended.
+      if (schedule_.ends_start(step)) EndStart(schedule_.start(step - 1));
+      if (step == schedule_.steps()) return absl::OkStatus();
+      const bool screens = schedule_.screens(step);
+      const absl::Status stepped = Step(iteration);
+      if (!stepped.ok() && !(screens && DropStart(step))) {
+        if (on_step) on_step({.state = *state_, .iterations = schedule_.steps(), .diverged = true});
         return stepped;
       }
-      const bool validate = !systems_.validation.empty() && (state_->iteration % spec_.validation_period == 0 ||
-                                                             state_->iteration == spec_.iterations);
+      const bool validate = stepped.ok() && !systems_.validation.empty() &&
+                            ((iteration + 1) % spec_.validation_period == 0 || iteration + 1 == spec_.iterations ||
+                             schedule_.ends_start(state_->iteration));
       if (validate) Validate();
-      if (on_step && !on_step({*state_, spec_.iterations, validate})) {
+      if (on_step && !on_step({*state_, schedule_.steps(), validate})) {
         return absl::CancelledError("the training was cancelled");
       }
     }
-    return absl::OkStatus();
   }
 
  private:
-  absl::Status Step() {
+  // ---- screening ----
+
+  /// A start that has diverged ends early, unless it is the last hope. @return whether another goes on.
+  bool DropStart(int32_t step) {
+    const int32_t start = schedule_.start(step);
+    if (start + 1 == schedule_.restarts() && !state_->values.contains(kScreenedLosses)) return false;
+    state_->iteration = schedule_.first_step(start + 1);
+    state_->validation_loss = std::numeric_limits<double>::infinity();
+    return true;
+  }
+
+  /// Puts the start that has been screened beside the best so far, and begins the next or goes on with the best.
+  void EndStart(int32_t start) {
+    auto& values = state_->values;
+    std::map<std::string, std::vector<double>> own, best;
+    for (const auto& [name, numbers] : values) {
+      if (name.starts_with(kScreened)) {
+        best[name] = numbers;
+      } else {
+        own[name] = numbers;
+      }
+    }
+    const bool last = start + 1 == schedule_.restarts();
+    if (best.empty() ? last || std::isfinite(state_->validation_loss) : state_->validation_loss < best[kScreenedLosses][0]) {
+      best.clear();
+      for (const auto& [name, numbers] : own) best[kScreened + name] = numbers;
+      best[kScreenedLosses] = {state_->validation_loss, state_->best_validation_loss, state_->training_loss};
+    }
+    good_.reset();
+    if (!last) {
+      state_->best_validation_loss = state_->validation_loss = std::numeric_limits<double>::infinity();
+      values = FreshValues(spec_, model_, mask_, start + 1);
+      values.merge(best);
+      return;
+    }
+    state_->validation_loss = best[kScreenedLosses][0];
+    state_->best_validation_loss = best[kScreenedLosses][1];
+    state_->training_loss = best[kScreenedLosses][2];
+    for (auto& [name, numbers] : own) numbers = best[kScreened + name];
+    values = std::move(own);
+  }
+
+  // ---- steps ----
+
+  /// @param iteration  of the training, from 0 on, that this step is.
+  absl::Status Step(int32_t iteration) {
     std::vector<double>& parameters = state_->values[kParameters];
     std::vector<double>& first_moment = state_->values[kFirstMoment];
     std::vector<double>& second_moment = state_->values[kSecondMoment];
-    const bool warming_up = state_->iteration < spec_.warmup_iterations;
-    if (state_->iteration == spec_.warmup_iterations) {
+    const bool warming_up = iteration < spec_.warmup_iterations;
+    if (iteration == spec_.warmup_iterations) {
       // Another loss: the warm-up's squared gradients would throttle the first thousand steps on it.
       std::fill(first_moment.begin(), first_moment.end(), 0.0);
       std::fill(second_moment.begin(), second_moment.end(), 0.0);
     }
-    const double loss = (warming_up ? *warmup_ : main_).Gradient(state_->iteration, parameters, &gradient_);
+    const double loss = (warming_up ? *warmup_ : main_).Gradient(iteration, parameters, &gradient_);
     const double norm = ClipNorm(spec_.clip_norm, &gradient_);
-    const int32_t step = state_->iteration + 1 - (warming_up ? 0 : spec_.warmup_iterations);
+    const int32_t step = iteration + 1 - (warming_up ? 0 : spec_.warmup_iterations);
     const double first_loss = step == 1 ? loss : state_->values[kFirstLoss].front();
     const double last = step == 1 ? loss : state_->training_loss;
     const double mean_loss = last + kTrainingLossWeight * (loss - last);
     if (!std::isfinite(loss) || !std::isfinite(norm) || mean_loss > kHopeless * std::max(1.0, first_loss)) {
-      const int32_t iteration = state_->iteration + 1;
       if (good_) *state_ = *std::move(good_);
-      return Diverged(spec_, iteration, loss, norm, *state_);
+      return Diverged(spec_, iteration + 1, loss, norm, *state_);
     }
     good_ = *state_;
     state_->values[kFirstLoss].front() = first_loss;
     state_->training_loss = mean_loss;
-    const double rate = LearningRate(spec_, state_->iteration);
+    const double rate = LearningRate(spec_, iteration);
     ++state_->iteration;
     AdamStep(gradient_, step, rate, &first_moment, &second_moment, &parameters);
     nssm::RoundToPrecision(spec_.model.precision, &parameters);
@@ -218,8 +313,11 @@ class OuterLoop {
   }
 
   const TrainingSpec& spec_;
+  const nssm::Model& model_;
+  const nn::Mask& mask_;
   const Systems& systems_;
   TrainingState* state_;
+  const Schedule schedule_;
   std::optional<TrainingState> good_;  // at the newest loss and gradient that were numbers
   Phase<T> main_;
   std::optional<Phase<T>> warmup_;
@@ -228,18 +326,7 @@ class OuterLoop {
 
 /// A state to begin with, or to go on from if it has what the loop needs.
 absl::Status Prepare(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask, TrainingState* state) {
-  std::vector<double> parameters = model.InitialParameters(spec.seed);
-  if (spec.inner_loop.learned_rates) {
-    const std::vector<double> rates = RatesOfTensors(spec.inner_loop, model.layout());
-    for (size_t i = 0; i < mask.size(); ++i) {
-      if (mask[i]) parameters.push_back(std::log(rates[i]));
-    }
-  }
-  nssm::RoundToPrecision(spec.model.precision, &parameters);
-  const std::vector<double> zeros(parameters.size());
-  const std::map<std::string, std::vector<double>> fresh = {{kParameters, parameters}, {kFirstMoment, zeros},
-                                                            {kSecondMoment, zeros},    {kBest, parameters},
-                                                            {kFirstLoss, {0}}};
+  const std::map<std::string, std::vector<double>> fresh = FreshValues(spec, model, mask, 0);
   if (state->values.empty()) {
     state->values = fresh;
     state->best_validation_loss = state->validation_loss = std::numeric_limits<double>::infinity();

@@ -35,6 +35,9 @@ struct LearnedStart {
 /// A training diverges when a loss or gradient is no number, or the running mean of the loss is a million times what the
 /// phase began with (and 1). The state then goes back to before the step that led there, and on_step hears of it once more.
 ///
+/// Of several starts each goes through the first `screening_iterations`, the same tasks in the same order; the one with the
+/// least validation loss then goes on as if it had been alone. A start that diverges has lost. The state counts all steps.
+///
 /// @return the best on validation, the last if there is no validation.
 /// Errors: Cancelled if on_step said so; OutOfRange when the training diverges, with the reason.
 absl::StatusOr<LearnedStart> RunOuterLoop(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,

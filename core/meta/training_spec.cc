@@ -124,6 +124,16 @@ void CheckInnerLoop(const TrainingSpec& spec, JsonFields* fields) {
   }
 }
 
+/// Whether there is something to choose among several starts by.
+void CheckRestarts(const TrainingSpec& spec, JsonFields* fields) {
+  if (spec.restarts == 1) return;
+  if (spec.algorithm == Algorithm::kGaussianPrior) fields->Fail("restarts", "GAUSSIAN_PRIOR has gaussian_prior.restarts");
+  if (spec.screening_iterations == 0 || spec.screening_iterations > spec.iterations) {
+    fields->Fail("screening_iterations", absl::StrCat("must be from 1 to the ", spec.iterations, " iterations if there are restarts"));
+  }
+  if (spec.validation_share == 0) fields->Fail("validation_share", "must be positive if there are restarts to choose among");
+}
+
 }  // namespace
 
 absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
@@ -150,6 +160,8 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
   spec.target_samples = positive("target_samples", spec.target_samples);
   spec.task_batch = positive("task_batch", spec.task_batch);
   spec.iterations = positive("iterations", spec.iterations);
+  spec.restarts = positive("restarts", spec.restarts);
+  spec.screening_iterations = static_cast<int32_t>(fields.Integer("screening_iterations", 0, 0, kMany));
   spec.warmup_iterations = static_cast<int32_t>(fields.Integer("warmup_iterations", 0, 0, kMany));
   spec.warmup_horizon = positive("warmup_horizon", spec.warmup_horizon);
   spec.outer_lr = fields.Number("outer_lr", spec.outer_lr, 0, 1e3);
@@ -158,6 +170,7 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
   spec.clip_norm = fields.Number("clip_norm", spec.clip_norm, 0, 1e12);
   spec.validation_share = fields.Number("validation_share", spec.validation_share, 0, 0.9);
   spec.validation_period = positive("validation_period", spec.validation_period);
+  CheckRestarts(spec, &fields);
   spec.seed = static_cast<uint64_t>(fields.Integer("seed", 0, 0, INT64_MAX));
   spec.sample_period_s = fields.Number("sample_period_s", 0, 0, 1e9);
   METAEKF_RETURN_IF_ERROR(fields.Finish());
@@ -183,6 +196,8 @@ json ToJson(const TrainingSpec& spec) {
           {"target_samples", spec.target_samples},
           {"task_batch", spec.task_batch},
           {"iterations", spec.iterations},
+          {"restarts", spec.restarts},
+          {"screening_iterations", spec.screening_iterations},
           {"warmup_iterations", spec.warmup_iterations},
           {"warmup_horizon", spec.warmup_horizon},
           {"warmup_lr", spec.warmup_lr},

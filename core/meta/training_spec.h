@@ -56,6 +56,8 @@ struct TrainingSpec {
   int32_t target_samples = 100;
   int32_t task_batch = 8;
   int32_t iterations = 1000;
+  int32_t restarts = 1;
+  int32_t screening_iterations = 0;
   int32_t warmup_iterations = 0;
   int32_t warmup_horizon = 10;
   double warmup_lr = 1e-3;

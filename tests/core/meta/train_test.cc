@@ -4,6 +4,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
+#include <map>
 
 #include "core/meta/adapt.h"
 #include "core/base/rng.h"
@@ -88,6 +90,9 @@ std::vector<Variant> Variants() {
     add(std::string("ImplicitMaml") + suffix, Algorithm::kImplicitMaml, optimiser, false);
   }
   add("FirstOrderMaml", Algorithm::kFirstOrderMaml, Optimiser::kGradientDescent, false);
+  add("MamlFromSeveralStarts", Algorithm::kMaml, Optimiser::kGradientDescent, false);
+  variants.back().spec.restarts = 2;
+  variants.back().spec.screening_iterations = 12;
   add("Supervised", Algorithm::kSupervised, Optimiser::kGradientDescent, false);
   add("ImplicitMamlByLevenbergMarquardt", Algorithm::kImplicitMaml, Optimiser::kLevenbergMarquardt, false);
   TrainingSpec& by_least_squares = variants.back().spec;
@@ -123,6 +128,88 @@ TEST_P(EveryAlgorithmTest, ResumedEqualsUninterrupted) {
     ASSERT_TRUE(state.ok()) << state.status();
     EXPECT_EQ(TrainedFile(spec, 2, &*state), TrainedFile(spec, 1)) << "stopped at " << stop;
   }
+}
+
+/// Validation losses by step, and the model that came out.
+struct Course {
+  std::map<int32_t, double> losses;
+  std::vector<double> parameters;
+};
+
+Course CourseOf(const TrainingSpec& spec) {
+  const auto executor = base::MakeSerialExecutor();
+  Course course;
+  const absl::StatusOr<nssm::Bundle> bundle = Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), [&](const TrainingProgress& p) {
+    EXPECT_LE(p.state.iteration, p.iterations);
+    if (p.validated) course.losses[p.state.iteration] = p.state.validation_loss;
+    return true;
+  });
+  EXPECT_TRUE(bundle.ok()) << bundle.status();
+  if (bundle.ok()) course.parameters = bundle->parameters;
+  return course;
+}
+
+TEST(RestartsTest, TheBestStartOfAllGoesOn) {
+  TrainingSpec spec = SmallSpec();
+  for (spec.seed = 0;; ++spec.seed) {
+    ASSERT_LT(spec.seed, 50u);
+    spec.restarts = 1;
+    spec.screening_iterations = 0;
+    const Course alone = CourseOf(spec);
+    spec.restarts = 4;
+    spec.screening_iterations = 20;
+    const Course screened = CourseOf(spec);
+    EXPECT_EQ(screened.losses.at(20), alone.losses.at(20));
+    EXPECT_EQ(screened.losses.rbegin()->first, 30 + 3 * 20);
+    std::vector<double> ends;
+    for (const int32_t end : {20, 40, 60, 80}) ends.push_back(screened.losses.at(end));
+    const auto best = std::min_element(ends.begin(), ends.end());
+    if (best == ends.begin() || best + 1 == ends.end()) continue;  // could be had without choosing
+    EXPECT_NE(screened.parameters, alone.parameters);
+    // Screened to the end, the model is that of the best: those behind it change nothing.
+    spec.screening_iterations = spec.iterations;
+    const Course to_the_end = CourseOf(spec);
+    ends.clear();
+    for (const int32_t end : {30, 60, 90, 120}) ends.push_back(to_the_end.losses.at(end));
+    EXPECT_EQ(to_the_end.losses.size(), 12u);
+    spec.restarts = 1 + static_cast<int32_t>(std::min_element(ends.begin(), ends.end()) - ends.begin());
+    if (spec.restarts == 1) spec.screening_iterations = 0;
+    EXPECT_EQ(CourseOf(spec).parameters, to_the_end.parameters);
+    return;
+  }
+}
+
+TEST(RestartsTest, WithTheFirstStartBestTheyChangeNothing) {
+  TrainingSpec spec = SmallSpec();
+  for (spec.seed = 0;; ++spec.seed) {
+    ASSERT_LT(spec.seed, 50u);
+    spec.restarts = 1;
+    spec.screening_iterations = 0;
+    const Course alone = CourseOf(spec);
+    spec.restarts = 2;
+    spec.screening_iterations = 20;
+    const Course screened = CourseOf(spec);
+    if (screened.losses.at(40) <= alone.losses.at(20)) continue;  // the second was better
+    EXPECT_EQ(screened.parameters, alone.parameters);
+    EXPECT_EQ(screened.losses.at(50), alone.losses.at(30));
+    return;
+  }
+}
+
+TEST(RestartsTest, IfAllStartsDivergeTheTrainingHas) {
+  TrainingSpec spec = SmallSpec();
+  spec.restarts = 3;
+  spec.screening_iterations = 20;
+  spec.warmup_iterations = 0;
+  spec.outer_lr = spec.final_outer_lr = 1e3;
+  const auto executor = base::MakeSerialExecutor();
+  int32_t last = 0;
+  const absl::Status status = Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), [&](const TrainingProgress& p) {
+                                last = p.state.iteration;
+                                return true;
+                              }).status();
+  EXPECT_EQ(status.code(), absl::StatusCode::kOutOfRange) << status;
+  EXPECT_GE(last, 2 * 20);
 }
 
 TEST_P(EveryAlgorithmTest, LowersTheLossOfHeldOutSystems) {

@@ -22,13 +22,18 @@ TEST(TrainingSpecTest, EveryAlgorithmIsReadAndWritten) {
 
 TEST(TrainingSpecTest, WhatIsWrittenReadsBack) {
   const json inner = {{"learned_rates", true}, {"optimiser", "ADAM"}, {"tensor_rates", {{"encoder.0.weight", 0.5}}}};
-  const json spec = WithModel({{"inner_loop", inner}, {"implicit_maml", {{"cg_steps", 7}, {"cg_tolerance", 0.125}}}});
+  const json spec = WithModel({{"inner_loop", inner},
+                               {"implicit_maml", {{"cg_steps", 7}, {"cg_tolerance", 0.125}}},
+                               {"restarts", 3},
+                               {"screening_iterations", 40}});
   const auto read = ReadTrainingSpec(spec);
   ASSERT_TRUE(read.ok()) << read.status();
   EXPECT_TRUE(read->inner_loop.learned_rates);
   EXPECT_TRUE(read->adaptation.learned_rates);
   EXPECT_EQ(read->inner_loop.tensor_rates.at("encoder.0.weight"), 0.5);
   EXPECT_EQ(read->implicit_maml.cg_steps, 7);
+  EXPECT_EQ(read->restarts, 3);
+  EXPECT_EQ(read->screening_iterations, 40);
   EXPECT_EQ(ToJson(*ReadTrainingSpec(ToJson(*read))), ToJson(*read));
 }
 
@@ -81,6 +86,10 @@ TEST(TrainingSpecTest, WhatAnAlgorithmCannotUseIsRefusedByName) {
   expect_refused({{"inner_loop", {{"tensor_rates", {{"a", -1}}}}}}, "inner_loop.tensor_rates.a");
   expect_refused({{"inner_loop", {{"tensor_rates", 3}}}}, "inner_loop.tensor_rates");
   expect_refused({{"implicit_maml", {{"cg_tolerance", 2}}}}, "implicit_maml.cg_tolerance");
+  expect_refused({{"restarts", 2}}, "screening_iterations");
+  expect_refused({{"restarts", 2}, {"screening_iterations", 101}, {"iterations", 100}}, "screening_iterations");
+  expect_refused({{"restarts", 2}, {"screening_iterations", 10}, {"validation_share", 0}}, "validation_share");
+  expect_refused({{"algorithm", "GAUSSIAN_PRIOR"}, {"restarts", 2}, {"screening_iterations", 10}}, "restarts");
   expect_refused({{"gaussian_prior", {{"rank", 2}}}}, "gaussian_prior.rank");
   expect_refused({{"gaussian_prior", {{"covariance", "BLOCK"}, {"rank", 2}}}}, "gaussian_prior.rank");
   expect_refused({{"gaussian_prior", {{"covariance", "LOW_RANK"}}}}, "gaussian_prior.rank");
