@@ -1,5 +1,6 @@
 #include "core/linalg/decompositions.h"
 
+#include <cblas.h>
 #include <gtest/gtest.h>
 
 #include <Eigen/LU>
@@ -77,6 +78,11 @@ TEST_P(SizeTest, TheResidualOfLeastSquaresIsOrthogonalToTheColumns) {
   const MatrixXd x = SolveLeastSquares(a, b);
   ASSERT_EQ(x.rows(), n);
   EXPECT_LT(Difference(a.transpose() * (a * x - b), MatrixXd::Zero(n, 2)), 1e-11);
+}
+
+TEST(BlasTest, StaysInOneThread) {
+  ASSERT_TRUE(Cholesky(MatrixXd::Identity(2, 2)).ok());
+  EXPECT_EQ(openblas_get_num_threads(), 1);
 }
 
 TEST(CholeskyTest, RefusesWhatIsNotPositiveDefinite) {
