@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <optional>
 #include <string>
+#include <utility>
 
 #include "client/cli/console.h"
 
@@ -26,8 +27,9 @@ class Progress {
 
   Console& console_;
   std::string label_;
-  Clock::time_point start_ = Clock::now();
-  Clock::time_point last_ = start_;
+  Clock::time_point last_ = Clock::now();
+  /// The first report, and what was done by then: what came before it may have been other work.
+  std::optional<std::pair<Clock::time_point, uint64_t>> pace_from_;
   bool drawn_ = false;
 };
 

@@ -344,6 +344,10 @@ absl::Status Prepare(const TrainingSpec& spec, const nssm::Model& model, const n
 absl::StatusOr<LearnedStart> RunOuterLoop(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
                                           const Systems& systems, base::Executor* executor, TrainingState* state,
                                           const OnTrainingStep& on_step) {
+  if (spec.restarts > 1 && systems.validation.empty()) {
+    return absl::InvalidArgumentError(
+        "restarts: there is no system to choose among starts by; a larger validation_share holds some out");
+  }
   METAEKF_RETURN_IF_ERROR(Prepare(spec, model, mask, state));
   METAEKF_RETURN_IF_ERROR(spec.model.precision == nssm::Precision::kFloat32
                               ? OuterLoop<float>(spec, model, mask, systems, executor, state).Run(on_step)

@@ -39,7 +39,8 @@ struct LearnedStart {
 /// least validation loss then goes on as if it had been alone. A start that diverges has lost. The state counts all steps.
 ///
 /// @return the best on validation, the last if there is no validation.
-/// Errors: Cancelled if on_step said so; OutOfRange when the training diverges, with the reason.
+/// Errors: Cancelled if on_step said so; OutOfRange when the training diverges, with the reason; InvalidArgument if there are
+/// several starts and no held-out systems.
 absl::StatusOr<LearnedStart> RunOuterLoop(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
                                           const Systems& systems, base::Executor* executor, TrainingState* state,
                                           const OnTrainingStep& on_step);

@@ -10,6 +10,7 @@ namespace {
 
 using ::testing::AllOf;
 using ::testing::HasSubstr;
+using ::testing::Not;
 using ::testing::StartsWith;
 
 TEST(ProgressTest, DurationsAreForPeople) {
@@ -30,6 +31,15 @@ TEST(ProgressTest, ABarIsDrawnAndClearedOnATerminal) {
                                HasSubstr("1 min 5 s left, loss 0.5")));
   EXPECT_TRUE(err.str().ends_with("\r\x1b[K"));
   EXPECT_EQ(out.str(), "");
+}
+
+TEST(ProgressTest, OneReportAloneTellsNoPace) {
+  std::istringstream in;
+  std::ostringstream out, err;
+  Console console(in, out, err, true);
+  Progress bar(console, "adapting");
+  bar.Update(1, 60, {}, "");
+  EXPECT_THAT(err.str(), AllOf(HasSubstr("1/60"), Not(HasSubstr("left"))));
 }
 
 TEST(ProgressTest, ElsewhereThereIsNoBar) {

@@ -92,7 +92,7 @@ std::vector<Variant> Variants() {
   add("FirstOrderMaml", Algorithm::kFirstOrderMaml, Optimiser::kGradientDescent, false);
   add("MamlFromSeveralStarts", Algorithm::kMaml, Optimiser::kGradientDescent, false);
   variants.back().spec.restarts = 2;
-  variants.back().spec.screening_iterations = 12;
+  variants.back().spec.screening_iterations = 10;  // one of the stops below is the end of a start
   add("Supervised", Algorithm::kSupervised, Optimiser::kGradientDescent, false);
   add("ImplicitMamlByLevenbergMarquardt", Algorithm::kImplicitMaml, Optimiser::kLevenbergMarquardt, false);
   TrainingSpec& by_least_squares = variants.back().spec;
