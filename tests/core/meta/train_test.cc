@@ -149,16 +149,17 @@ Course CourseOf(const TrainingSpec& spec) {
   return course;
 }
 
+Course CourseWith(TrainingSpec spec, int32_t restarts, int32_t screening_iterations) {
+  spec.restarts = restarts;
+  spec.screening_iterations = screening_iterations;
+  return CourseOf(spec);
+}
+
 TEST(RestartsTest, TheBestStartOfAllGoesOn) {
   TrainingSpec spec = SmallSpec();
   for (spec.seed = 0;; ++spec.seed) {
     ASSERT_LT(spec.seed, 50u);
-    spec.restarts = 1;
-    spec.screening_iterations = 0;
-    const Course alone = CourseOf(spec);
-    spec.restarts = 4;
-    spec.screening_iterations = 20;
-    const Course screened = CourseOf(spec);
+    const Course alone = CourseOf(spec), screened = CourseWith(spec, 4, 20);
     EXPECT_EQ(screened.losses.at(20), alone.losses.at(20));
     EXPECT_EQ(screened.losses.rbegin()->first, 30 + 3 * 20);
     std::vector<double> ends;
@@ -167,14 +168,12 @@ TEST(RestartsTest, TheBestStartOfAllGoesOn) {
     if (best == ends.begin() || best + 1 == ends.end()) continue;  // could be had without choosing
     EXPECT_NE(screened.parameters, alone.parameters);
     // Screened to the end, the model is that of the best: those behind it change nothing.
-    spec.screening_iterations = spec.iterations;
-    const Course to_the_end = CourseOf(spec);
+    const Course to_the_end = CourseWith(spec, 4, spec.iterations);
     ends.clear();
     for (const int32_t end : {30, 60, 90, 120}) ends.push_back(to_the_end.losses.at(end));
     EXPECT_EQ(to_the_end.losses.size(), 12u);
-    spec.restarts = 1 + static_cast<int32_t>(std::min_element(ends.begin(), ends.end()) - ends.begin());
-    if (spec.restarts == 1) spec.screening_iterations = 0;
-    EXPECT_EQ(CourseOf(spec).parameters, to_the_end.parameters);
+    const int32_t up_to_it = 1 + static_cast<int32_t>(std::min_element(ends.begin(), ends.end()) - ends.begin());
+    EXPECT_EQ(CourseWith(spec, up_to_it, spec.iterations).parameters, to_the_end.parameters);
     return;
   }
 }
@@ -183,12 +182,7 @@ TEST(RestartsTest, WithTheFirstStartBestTheyChangeNothing) {
   TrainingSpec spec = SmallSpec();
   for (spec.seed = 0;; ++spec.seed) {
     ASSERT_LT(spec.seed, 50u);
-    spec.restarts = 1;
-    spec.screening_iterations = 0;
-    const Course alone = CourseOf(spec);
-    spec.restarts = 2;
-    spec.screening_iterations = 20;
-    const Course screened = CourseOf(spec);
+    const Course alone = CourseOf(spec), screened = CourseWith(spec, 2, 20);
     if (screened.losses.at(40) <= alone.losses.at(20)) continue;  // the second was better
     EXPECT_EQ(screened.parameters, alone.parameters);
     EXPECT_EQ(screened.losses.at(50), alone.losses.at(30));
