@@ -264,10 +264,6 @@ class Compiler {
         i.width = node.width;
         i.count = node.count;
         break;
-      case Op::kKhatriRao:
-        i.op = Opcode::kKhatriRao;
-        i.inner = graph.node(node.inputs[0]).rows;
-        break;
       case Op::kConcatRows: {
         int32_t first = 0;
         for (const Value part : node.inputs) {

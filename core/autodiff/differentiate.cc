@@ -180,9 +180,6 @@ class ForwardMode {
         return graph_.Tile(t(0), node.width, node.count);
       case Op::kSumTiles:
         return graph_.SumTiles(t(0), node.width, node.count);
-      case Op::kKhatriRao:
-        assert(false);  // the last step of a derivative: see PerColumn
-        return kNoValue;
       case Op::kConcatRows: {
         std::vector<Value> parts;
         for (const Value input : node.inputs) parts.push_back(TangentOrZero(input));
@@ -348,9 +345,6 @@ class ReverseMode {
         return;
       case Op::kSumTiles:
         Accumulate(in(0), graph_.Tile(g, node.width, node.count));
-        return;
-      case Op::kKhatriRao:
-        assert(false);  // the last step of a derivative: see PerColumn
         return;
       case Op::kConcatRows: {
         int32_t first = 0;

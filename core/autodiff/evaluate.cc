@@ -119,8 +119,6 @@ class Machine {
                                static_cast<size_t>(int64_t{i.rows} * i.cols));
       case Opcode::kSumTiles:
         return SumTiles(i, t);
-      case Opcode::kKhatriRao:
-        return KhatriRao(i, t);
       case Opcode::kCopyRows: {
         T* out = At(i.out, t) + i.first;
         const T* a = At(i.a, t);
@@ -174,18 +172,6 @@ class Machine {
       a += size;
       for (int32_t repeat = 1; repeat < i.count; ++repeat, a += size) {
         for (int64_t k = 0; k < size; ++k) sum[k] += a[k];
-      }
-    }
-  }
-
-  void KhatriRao(const Instruction& i, int64_t t) const {
-    T* out = At(i.out, t);
-    const T* a = At(i.a, t);
-    const T* b = At(i.b, t);
-    const int32_t rows_b = i.rows / i.inner;
-    for (int32_t col = 0; col < i.cols; ++col, a += i.a.ld, b += i.b.ld) {
-      for (int32_t k = 0; k < rows_b; ++k, out += i.inner) {
-        for (int32_t l = 0; l < i.inner; ++l) out[l] = a[l] * b[k];
       }
     }
   }

@@ -151,13 +151,6 @@ Value Graph::SumTiles(Value a, int32_t width, int32_t count) {
                  .count = count});
 }
 
-Value Graph::KhatriRao(Value a, Value b) {
-  assert(node(a).cols == node(b).cols);
-  const int32_t rows = node(a).rows * node(b).rows, cols = node(a).cols;
-  if (IsConstant(a, 0) || IsConstant(b, 0)) return Constant(0, rows, cols);
-  return Append({.op = Op::kKhatriRao, .rows = rows, .cols = cols, .inputs = {a, b}});
-}
-
 Value Graph::ConcatRows(const std::vector<Value>& parts) {
   if (parts.size() == 1) return parts[0];
   int32_t rows = 0;

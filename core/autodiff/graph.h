@@ -29,7 +29,6 @@ enum class Op : uint8_t {
   kConcatRows,  // [A; B; …]
   kSliceRows,   // rows first … first + rows − 1 of A
   kPadRows,     // A as rows first … of a matrix of zeros
-  kKhatriRao,   // column t: the elements of a_t b_tᵀ, column by column
   kScan,        // a recurrence; see Scan. Its values are read by the two operations below
   kCollect,     // body value `index` of every step, side by side: n × (T·w)
   kFinalCarry,  // carry `index` after the last step
@@ -94,8 +93,6 @@ class Graph {
   /// Repeats each block of `width` columns `count` times: [a₁ a₂] → [a₁ … a₁ a₂ … a₂].
   Value Tile(Value a, int32_t width, int32_t count);
   Value SumTiles(Value a, int32_t width, int32_t count);
-  /// Column t is a_t b_tᵀ as a vector, column-major: (rows of a · rows of b) × columns.
-  Value KhatriRao(Value a, Value b);
   Value ConcatRows(const std::vector<Value>& parts);
   Value SliceRows(Value a, int32_t first, int32_t rows);
   Value PadRows(Value a, int32_t first, int32_t rows);

@@ -33,7 +33,6 @@ enum class Opcode : uint8_t {
   kDot,
   kActivation,
   kSumTiles,
-  kKhatriRao,  // `inner` rows of a
   kCopyRows,   // out's rows first … = a
   kSliceRows,  // out = a's rows first …
   kLoop,       // runs Program::loops[index]

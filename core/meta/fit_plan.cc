@@ -23,9 +23,10 @@ namespace {
 constexpr Index kScreeningSamples = 300;   // of the context, to choose among starts
 constexpr int kScreeningSteps = 3;         // for c₀ of each
 constexpr size_t kContenders = 3;          // starts that go on
-constexpr int kContenderSteps = 10;
+constexpr int kContenderSteps = 7;
 constexpr double kContenderTolerance = 1e-3;
-constexpr double kWarmDamping = 1e-2;      // of the fit that goes on from a contender's
+constexpr double kWarmDamping = 1e-2;      // of a fit from parameters that have been learned
+constexpr double kContinuedDamping = 1e-4; // of a fit that goes on from one to fewer samples of the system
 constexpr double kFromScratchPrecision = 1e-6;  // knows nothing
 constexpr double kFromScratchTolerance = 1e-5;
 constexpr int kHorizonGrowth = 4;          // from one stage to the next
@@ -46,6 +47,7 @@ double Penalty(const Belief& belief, const VectorXd& x, Index adapted) {
 struct Candidate {
   double cost = 0;
   VectorXd unknowns;
+  double damping = kWarmDamping;
 };
 
 bool Cheaper(const Candidate& a, const Candidate& b) { return a.cost < b.cost; }
@@ -127,7 +129,7 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
   const Belief belief = plan.BeliefOf(prior, mean);
   METAEKF_ASSIGN_OR_RETURN(const LossData<double> data, plan.dynamics.Cut(normalised));
   RolloutLeastSquares::Workspace workspace(plan.dynamics, data.shape);
-  std::vector<Candidate> candidates{{.unknowns = options.from}};
+  std::vector<Candidate> candidates{{.unknowns = options.from, .damping = kContinuedDamping}};
   if (options.from.size() == 0) {
     METAEKF_ASSIGN_OR_RETURN(candidates, Screen(plan, prior, mean, belief, normalised));
   }
@@ -146,7 +148,7 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
                                 {.optimiser = {.max_iterations = std::min(kContenderSteps, options.steps),
                                                .tolerance = kContenderTolerance}},
                                 &workspace, tell);
-      candidate = {fit.cost, fit.unknowns};
+      candidate = {fit.cost, fit.unknowns, fit.damping};
       if (stopped) break;
     }
     std::stable_sort(candidates.begin(), candidates.end(), Cheaper);
@@ -154,7 +156,7 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
   result.fit = FitMap(plan.dynamics, data, mean, belief, candidates[0].unknowns,
                       {.optimiser = {.max_iterations = stopped ? 0 : options.steps,
                                      .tolerance = options.tolerance,
-                                     .initial_damping = kWarmDamping},
+                                     .initial_damping = candidates[0].damping},
                        .noise_samples = options.noise_samples},
                       &workspace, tell);
   ScatterAdapted(plan.dynamics, result.fit.unknowns, &result.parameters);

@@ -17,6 +17,8 @@ constexpr double kLargestDamping = 1e10;  // no step at all is left beyond it
 // A step under much damping brings little far from the optimum too: it takes several in a row, with the damping falling, to
 // say that there is no more to gain.
 constexpr int kQuietSteps = 3;
+constexpr double kBendWidth = 0.1;    // of the step: differences of residuals over it
+constexpr double kLargestBend = 0.75;  // 2 |a| / |δ| in D's metric, beyond which the second order says nothing either
 constexpr double kNothing = 1e-3;  // of the tolerance: a step that promises less is not worth taking
 
 }  // namespace
@@ -26,7 +28,9 @@ LevenbergMarquardtResult MinimiseLevenbergMarquardt(const Objective& objective, 
                                                     const std::function<bool(int, double)>& on_iteration) {
   LevenbergMarquardtResult result{.x = x};
   objective.linearise(result.x, &result.model);
-  double damping = options.initial_damping, growth = 2;
+  result.damping = options.initial_damping;
+  double& damping = result.damping;
+  double growth = 2;
   int quiet_steps = 0;
   while (result.iterations < options.max_iterations && damping < kLargestDamping) {
     const QuadraticModel& model = result.model;
@@ -48,7 +52,14 @@ LevenbergMarquardtResult MinimiseLevenbergMarquardt(const Objective& objective, 
       result.converged = true;
       break;
     }
-    const VectorXd next = result.x + step;
+    VectorXd next = result.x + step;
+    if (objective.bend) {
+      if (const std::optional<VectorXd> bend = objective.bend(result.x, step, kBendWidth)) {
+        const VectorXd acceleration = -factor.Solve(*bend);
+        const auto length = [&scale](const VectorXd& v) { return std::sqrt(v.cwiseAbs2().dot(scale)); };
+        if (2 * length(acceleration) <= kLargestBend * length(step)) next += 0.5 * acceleration;
+      }
+    }
     const double cost = objective.cost(next);
     const double gained = model.cost - cost;
     if (!(gained > 0)) {  // not a number, or worse

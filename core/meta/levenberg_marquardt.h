@@ -2,6 +2,7 @@
 
 #include <Eigen/Core>
 #include <functional>
+#include <optional>
 
 namespace metaekf::meta {
 
@@ -16,6 +17,9 @@ struct QuadraticModel {
 struct Objective {
   std::function<double(const Eigen::VectorXd&)> cost;  ///< may be infinite
   std::function<void(const Eigen::VectorXd&, QuadraticModel*)> linearise;
+  /// Jᵀ d²r(x + s δ)/ds², by differences of width h in s, at the x of the last linearisation; nothing where it is unknown.
+  /// May be empty.
+  std::function<std::optional<Eigen::VectorXd>(const Eigen::VectorXd& x, const Eigen::VectorXd& direction, double h)> bend;
 };
 
 struct LevenbergMarquardtOptions {
@@ -28,6 +32,7 @@ struct LevenbergMarquardtResult {
   Eigen::VectorXd x;
   QuadraticModel model;  ///< at x
   int iterations = 0;    ///< linearisations after the first
+  double damping = 0;    ///< for a minimisation that goes on from here
   bool converged = false;
   bool stopped = false;  ///< on_iteration said so
 };
@@ -38,6 +43,12 @@ struct LevenbergMarquardtResult {
 ///
 /// μ falls after steps that bring what the quadratic model promised and rises after those that do not
 /// (K. Madsen, H. B. Nielsen, O. Tingleff, Methods for Non-Linear Least Squares Problems, 2004, section 3.2).
+/// Where the objective says how its residuals bend, steps follow narrow curved valleys instead of falling out of them:
+///
+///   x ← x + δ + ½ a,   (B + μ D) a = −Jᵀ r″(δ, δ),
+///
+/// as long as the correction is small beside the step
+/// (M. K. Transtrum, J. P. Sethna, Improvements to the Levenberg–Marquardt algorithm, arXiv:1201.5885, 2012).
 ///
 /// @param on_iteration  called with (iteration, Φ) after every accepted step; false stops. May be empty.
 LevenbergMarquardtResult MinimiseLevenbergMarquardt(const Objective& objective, const Eigen::VectorXd& x,

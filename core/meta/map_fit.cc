@@ -83,10 +83,16 @@ MapFit FitMap(const RolloutLeastSquares& problem, const LossData<double>& data, 
     model->gradient = equations.gradient + belief.precision.selfadjointView<Eigen::Lower>() * (x - belief.mean);
     model->curvature = equations.curvature + belief.precision;
   };
+  objective.bend = [&](const VectorXd& x, const VectorXd& direction, double h) {  // the prior's residuals are straight
+    place(x + h * direction);
+    return problem.Bend(all.data(), start, h, direction, weights, data, workspace);
+  };
   MapFit fit{.unknowns = from, .noise_variance = belief.noise_variance};
+  LevenbergMarquardtOptions optimiser = options.optimiser;
   for (int round = 0; round < kNoiseRounds; ++round) {
     const LevenbergMarquardtResult result =
-        MinimiseLevenbergMarquardt(objective, fit.unknowns, options.optimiser, on_iteration);
+        MinimiseLevenbergMarquardt(objective, fit.unknowns, optimiser, on_iteration);
+    optimiser.initial_damping = fit.damping = result.damping;
     fit.unknowns = result.x;
     fit.information = result.model.curvature.selfadjointView<Eigen::Lower>();
     fit.channel_squares = equations.channel_squares;

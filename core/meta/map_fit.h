@@ -25,6 +25,7 @@ struct MapFit {
   Eigen::VectorXd channel_squares; ///< Σ r² of every channel
   double cost = 0;                 ///< ½ Σ w r² + ½ (θ − m)ᵀ Λ (θ − m)
   int iterations = 0;
+  double damping = 0;  ///< for a fit that goes on from here
   bool converged = false;
   bool stopped = false;
 };

@@ -3,17 +3,18 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <map>
 
 #include "core/autodiff/differentiate.h"
-#include "core/autodiff/per_column.h"
+#include "core/autodiff/outer_products.h"
 #include "core/linalg/blas.h"
-#include "core/nssm/sensitivity.h"
 
 namespace metaekf::nssm {
 namespace {
 
 using autodiff::Graph;
 using autodiff::kNoValue;
+using autodiff::OuterProduct;
 using autodiff::Output;
 using autodiff::Slots;
 using autodiff::Value;
@@ -38,29 +39,11 @@ enum Slot : int32_t {
 // Columns at a time: enough for wide products, few enough that their Jacobians stay in the cache.
 constexpr int32_t kColumns = 64;
 constexpr int64_t kPanel = 256;  // rows of J that are squared at a time
+constexpr int64_t kMostKept = int64_t{1} << 24;  // elements of J: 128 MiB
 
 /// Component `row` of a value with `rows` rows: the cotangent that picks it in every column.
 Value Pick(Graph* graph, int32_t row, int32_t rows, int32_t columns) {
   return graph->PadRows(graph->Constant(1, 1, columns), row, rows);
-}
-
-/// Appends to `outputs` the Jacobian of every component of `value` with respect to the parameters `wrt`: of each component
-/// one tensor after the other, size × columns each, from `offset` on.
-void AddParameterJacobian(Graph* graph, Value value, const std::vector<Value>& wrt, int64_t offset,
-                          std::vector<Output>* outputs) {
-  const int32_t rows = wrt.empty() ? 0 : graph->node(value).rows, columns = graph->node(value).cols;
-  for (int32_t row = 0; row < rows; ++row) {
-    const std::vector<Value> cotangents =
-        autodiff::Vjp(graph, {{value, Pick(graph, row, rows, columns)}}, wrt);
-    for (size_t i = 0; i < wrt.size(); ++i) {
-      const autodiff::Node& shape = graph->node(wrt[i]);
-      const int32_t size = shape.rows * shape.cols;
-      const Value part = cotangents[i] == kNoValue ? graph->Constant(0, size, columns)
-                                                   : autodiff::PerColumn(graph, cotangents[i], columns);
-      outputs->push_back({part, kByParametersOut, offset});
-      offset += int64_t{size} * columns;
-    }
-  }
 }
 
 /// Appends the Jacobian with respect to the carry: of each of its components a block of columns.
@@ -80,6 +63,79 @@ void AddCarryJacobian(Graph* graph, Value value, Value carry, int64_t offset, st
 }
 
 }  // namespace
+
+/// The Jacobian of a value with respect to the parameters: of each component its outer products.
+class RolloutLeastSquares::Workspace::DirectJacobian {
+ public:
+  DirectJacobian(Graph* graph, const std::vector<Value>& wrt) : graph_(graph), wrt_(wrt) {}
+
+  /// Appends the components of `value`, and to `outputs` what they are made of.
+  void Add(Value value, std::vector<Output>* outputs) {
+    const int32_t rows = graph_->node(value).rows, columns = graph_->node(value).cols;
+    for (int32_t row = 0; row < rows; ++row) {
+      const std::vector<Value> cotangents = autodiff::Vjp(graph_, {{value, Pick(graph_, row, rows, columns)}}, wrt_);
+      components_.emplace_back();
+      int64_t first = 0;
+      for (size_t i = 0; i < wrt_.size(); ++i) {
+        const autodiff::Node shape = graph_->node(wrt_[i]);
+        if (cotangents[i] != kNoValue) {
+          for (const OuterProduct& product : autodiff::OuterProducts(graph_, cotangents[i], columns)) {
+            AddTerms(product, columns, first, shape.rows, outputs);
+          }
+        }
+        first += int64_t{shape.rows} * shape.cols;
+      }
+    }
+  }
+
+  int64_t size() const { return size_; }
+
+  /// The terms of every component, once the program's output stands at `values`.
+  std::vector<std::vector<DirectTerm>> TermsAt(const double* values) const {
+    std::vector<std::vector<DirectTerm>> result;
+    for (const std::vector<Term>& component : components_) {
+      result.emplace_back();
+      for (const Term& t : component) {
+        result.back().push_back({values + t.a, t.b < 0 ? nullptr : values + t.b, t.rows, t.cols, t.first, t.stride});
+      }
+    }
+    return result;
+  }
+
+ private:
+  /// As DirectTerm, with the places of a and b in the output.
+  struct Term {
+    int64_t a, b;
+    size_t rows, cols, first, stride;
+  };
+
+  void AddTerms(const OuterProduct& product, int32_t columns, int64_t first, int32_t stride, std::vector<Output>* outputs) {
+    const int32_t rows = graph_->node(product.a).rows;
+    const int32_t cols = product.b == kNoValue ? 1 : graph_->node(product.b).rows;
+    const int32_t directions = graph_->node(product.a).cols / columns;
+    const int64_t a = PlaceOf(product.a, outputs), b = product.b == kNoValue ? -1 : PlaceOf(product.b, outputs);
+    for (int64_t k = 0; k < directions; ++k) {
+      components_.back().push_back({a + k * rows * columns, b < 0 ? b : b + k * cols * columns, static_cast<size_t>(rows),
+                                    static_cast<size_t>(cols), static_cast<size_t>(first + product.first),
+                                    static_cast<size_t>(stride)});
+    }
+  }
+
+  int64_t PlaceOf(Value value, std::vector<Output>* outputs) {
+    const auto [place, is_new] = places_.try_emplace(value, size_);
+    if (is_new) {
+      outputs->push_back({value, kByParametersOut, size_});
+      size_ += int64_t{graph_->node(value).rows} * graph_->node(value).cols;
+    }
+    return place->second;
+  }
+
+  Graph* graph_;
+  std::vector<Value> wrt_;
+  std::vector<std::vector<Term>> components_;
+  std::map<Value, int64_t> places_;  // what components share is written once
+  int64_t size_ = 0;
+};
 
 RolloutLeastSquares::RolloutLeastSquares(const Model& model, const LossSpec& loss, const nn::Mask& mask, bool free_start)
     : model_(model), loss_(loss), free_start_(free_start), mode_(loss.rollout), mask_(mask) {
@@ -112,7 +168,7 @@ RolloutLeastSquares::Workspace::Workspace(const RolloutLeastSquares& owner, cons
     : shape_(shape), width_(std::min(shape.rollouts, kColumns)), steps_(std::min(shape.horizon, std::max(1, kColumns / width_))) {
   const Model& model = owner.model_;
   const ModelSpec& spec = model.spec();
-  const int32_t n = owner.carry_size_, columns = width_ * steps_, p = owner.adapted_size_;
+  const int32_t n = owner.carry_size_, columns = width_ * steps_;
   const int32_t n_u = spec.input_size, unknowns = owner.unknowns();
   start_.setZero(model.start_size(), width_);
   first_input_.setZero(n_u, width_);
@@ -121,7 +177,6 @@ RolloutLeastSquares::Workspace::Workspace(const RolloutLeastSquares& owner, cons
   carries_.setZero(n, columns);
   next_.setZero(n, width_);
   channels_.setZero(owner.channels_, columns);
-  values_.setZero(n, width_);
   const auto bind = [&](Graph* graph, std::vector<Value>* wrt) {
     nn::ParameterValues parameters = nn::BindParameters(model.layout(), kParameters, graph);
     for (size_t i = 0; i < parameters.size(); ++i) {
@@ -139,8 +194,11 @@ RolloutLeastSquares::Workspace::Workspace(const RolloutLeastSquares& owner, cons
     const Value latent =
         parts.Encode(graph.Input(kStart, 0, model.start_size(), width_), input(&graph, kFirstInput, width_));
     std::vector<Output> outputs{{latent, kNextOut}};
-    AddParameterJacobian(&graph, latent, wrt, 0, &outputs);
+    DirectJacobian jacobian(&graph, wrt);
+    jacobian.Add(latent, &outputs);
     encode_.emplace(autodiff::Compile(graph, outputs));
+    by_parameters_of_start_.setZero(jacobian.size());
+    start_terms_ = jacobian.TermsAt(by_parameters_of_start_.data());
   }
   {
     Graph graph;
@@ -160,26 +218,27 @@ RolloutLeastSquares::Workspace::Workspace(const RolloutLeastSquares& owner, cons
     const Value carry = graph.Input(kCarry, 0, n, columns);
     const Step step = BuildStep(model, owner.mode_, parts, carry, input(&graph, kInputs, columns));
     std::vector<Output> outputs;
-    int64_t by_carry = 0, by_parameters = 0;
+    DirectJacobian jacobian(&graph, wrt);
+    int64_t by_carry = 0;
     const auto add = [&](Value value) {
-      const int64_t rows = graph.node(value).rows;
       AddCarryJacobian(&graph, value, carry, by_carry, &outputs);
-      AddParameterJacobian(&graph, value, wrt, by_parameters, &outputs);
-      by_carry += rows * n * columns;
-      by_parameters += rows * p * columns;
+      by_carry += int64_t{graph.node(value).rows} * n * columns;
+      jacobian.Add(value, &outputs);
     };
     add(step.next);
     if (owner.state_channels_ > 0) add(step.state);
     add(step.output);
     local_.emplace(autodiff::Compile(graph, outputs));
-    by_carry_.setZero(by_carry, 1);
-    by_parameters_.setZero(by_parameters, 1);
+    by_carry_.setZero(by_carry);
+    by_parameters_.setZero(jacobian.size());
+    terms_ = jacobian.TermsAt(by_parameters_.data());
   }
   sensitivity_.setZero(unknowns, n * width_);
   next_sensitivity_.setZero(unknowns, n);
-  direct_.setZero(unknowns);
   factors_.setZero(n);
-  rows_.setZero(unknowns, std::max<int64_t>(kPanel, owner.channels_));
+  const int64_t residuals = int64_t{shape.rollouts} * shape.horizon * owner.channels_;
+  holds_all_ = unknowns * residuals <= kMostKept;
+  rows_.setZero(unknowns, holds_all_ ? residuals : std::max<int64_t>(kPanel, owner.channels_));
   residuals_.setZero(rows_.cols());
 }
 
@@ -194,7 +253,7 @@ void RolloutLeastSquares::Encode(const double* parameters, const LossData<double
       .Input(kStart, w.start_.data())
       .Input(kFirstInput, w.first_input_.data())
       .Output(kNextOut, w.carry_.data())
-      .Output(kByParametersOut, w.by_parameters_.data());
+      .Output(kByParametersOut, w.by_parameters_of_start_.data());
   autodiff::Evaluate(w.encode_->executable, slots, w.encode_->arena);
 }
 
@@ -267,7 +326,7 @@ double RolloutLeastSquares::Cost(const double* parameters, const VectorXd& start
 void RolloutLeastSquares::Linearise(const double* parameters, const VectorXd& start, const VectorXd& weights,
                                     const LossData<double>& data, Workspace* workspace, NormalEquations* result) const {
   Workspace& w = *workspace;
-  const int32_t n = carry_size_, p = adapted_size_, q = channels_, all = unknowns();
+  const int32_t n = carry_size_, q = channels_, all = unknowns();
   const int64_t columns = w.inputs_.cols();
   result->cost = 0;
   result->channel_squares.setZero(q);
@@ -290,22 +349,18 @@ void RolloutLeastSquares::Linearise(const double* parameters, const VectorXd& st
     return by_carry_channels[int64_t{state_channels_} * n * columns + (carry * columns + column) * outputs + channel -
                              state_channels_];
   };
-  // Of a component at one of `width` columns, into direct_.
-  const auto gather_by_parameters = [&](int32_t component, int64_t column, int64_t width) {
-    const double* part = w.by_parameters_.data() + int64_t{component} * p * width;
-    double* to = w.direct_.data();
-    for (const auto& [offset, size] : adapted_) {
-      std::copy_n(part + column * size, size, to);
-      part += size * width;
-      to += size;
-    }
+  const auto propagate = [&](int32_t carries, const double* sensitivity, const std::vector<DirectTerm>& terms, int64_t column,
+                             double scale, double* target) {
+    PropagateSensitivity(static_cast<size_t>(all), static_cast<size_t>(carries), sensitivity, w.factors_.data(), terms.data(),
+                         terms.size(), static_cast<size_t>(column), scale, target);
   };
-  int64_t rows = 0;
+  int64_t rows = 0, squared = 0;
   const auto square = [&] {
-    cblas_dsyrk(CblasColMajor, CblasLower, CblasNoTrans, all, static_cast<int>(rows), 1, w.rows_.data(), all, 1,
-                result->curvature.data(), all);
-    result->gradient.noalias() += w.rows_.leftCols(rows) * w.residuals_.head(rows);
-    rows = 0;
+    cblas_dsyrk(CblasColMajor, CblasLower, CblasNoTrans, all, static_cast<int>(rows - squared), 1, w.rows_.col(squared).data(),
+                all, 1, result->curvature.data(), all);
+    result->gradient.noalias() += w.rows_.middleCols(squared, rows - squared) * w.residuals_.segment(squared, rows - squared);
+    squared = rows;
+    if (!w.holds_all_) rows = squared = 0;
   };
   ForEachPiece(parameters, start, data, workspace, [&](int32_t step, int32_t steps, int32_t first, int32_t count) {
     if (step == 0) {
@@ -314,8 +369,7 @@ void RolloutLeastSquares::Linearise(const double* parameters, const VectorXd& st
       if (!free_start_ && mode_ == RolloutMode::kLatent) {  // Encode has just written ∂𝓔/∂ω
         for (int32_t i = 0; i < n; ++i) {
           for (int32_t j = 0; j < count; ++j) {
-            gather_by_parameters(i, j, w.width_);
-            w.sensitivity_.col(j * n + i) = w.direct_;
+            propagate(0, w.sensitivity_.data(), w.start_terms_[static_cast<size_t>(i)], j, 1, w.sensitivity_.col(j * n + i).data());
           }
         }
       }
@@ -326,11 +380,8 @@ void RolloutLeastSquares::Linearise(const double* parameters, const VectorXd& st
         const int64_t local = int64_t{k} * w.width_ + j, column = int64_t{step + k} * data.shape.rollouts + first + j;
         auto sensitivity = w.sensitivity_.middleCols(j * n, n);
         const auto derivative = [&](int32_t component, double scale, double* target) {
-          gather_by_parameters(component, local, columns);
-          if (scale != 1) w.direct_ *= scale;
           for (int32_t i = 0; i < n; ++i) w.factors_[i] = scale * by_carry(component, i, local);
-          PropagateSensitivity(static_cast<size_t>(all), static_cast<size_t>(n), sensitivity.data(), w.factors_.data(),
-                               w.direct_.data(), target);
+          propagate(n, sensitivity.data(), w.terms_[static_cast<size_t>(component)], local, scale, target);
         };
         for (int32_t c = 0; c < q; ++c) {
           if (weights[c] == 0) continue;
@@ -338,7 +389,7 @@ void RolloutLeastSquares::Linearise(const double* parameters, const VectorXd& st
           result->channel_squares[c] += r * r;
           derivative(n + c, root[c], w.rows_.col(rows).data());
           w.residuals_[rows++] = root[c] * r;
-          if (rows == w.rows_.cols()) square();
+          if (rows - squared == kPanel || rows == w.rows_.cols()) square();
         }
         for (int32_t i = 0; i < n; ++i) derivative(i, 1, w.next_sensitivity_.col(i).data());
         sensitivity = w.next_sensitivity_;
@@ -346,8 +397,34 @@ void RolloutLeastSquares::Linearise(const double* parameters, const VectorXd& st
     }
     return true;
   });
-  square();
+  if (rows > squared) square();
   result->cost = 0.5 * weights.dot(result->channel_squares);
+}
+
+std::optional<VectorXd> RolloutLeastSquares::Bend(const double* parameters, const VectorXd& start, double h,
+                                                  const VectorXd& direction, const VectorXd& weights,
+                                                  const LossData<double>& data, Workspace* workspace) const {
+  Workspace& w = *workspace;
+  if (!w.holds_all_) return std::nullopt;
+  const VectorXd root = weights.cwiseSqrt();
+  VectorXd moved(w.residuals_.size());
+  Index rows = 0;
+  ForEachPiece(parameters, start, data, workspace, [&](int32_t step, int32_t steps, int32_t first, int32_t count) {
+    for (int32_t k = 0; k < steps; ++k) {
+      for (int32_t j = 0; j < count; ++j) {
+        const int64_t column = int64_t{step + k} * data.shape.rollouts + first + j;
+        for (int32_t c = 0; c < channels_; ++c) {
+          if (weights[c] != 0) moved[rows++] = root[c] * Residual(data, c, column, w.channels_(c, k * w.width_ + j));
+        }
+      }
+    }
+    return true;
+  });
+  const auto jacobian = w.rows_.leftCols(rows);
+  // r(x + h δ) = r + h J δ + ½ h² r″ + …
+  const VectorXd bend = (2 / (h * h)) * (moved.head(rows) - w.residuals_.head(rows) - h * (jacobian.transpose() * direction));
+  if (!bend.allFinite()) return std::nullopt;
+  return jacobian * bend;
 }
 
 MatrixXd RolloutLeastSquares::Predictions(const double* parameters, const VectorXd& start, const LossData<double>& data,

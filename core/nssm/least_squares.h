@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "core/nssm/loss.h"
+#include "core/nssm/sensitivity.h"
 
 namespace metaekf::nssm {
 
@@ -42,9 +43,12 @@ class RolloutLeastSquares {
   class Workspace {
    public:
     Workspace(const RolloutLeastSquares& owner, const LossShape& shape);
+    Workspace(const Workspace&) = delete;  // terms point into it
+    Workspace& operator=(const Workspace&) = delete;
 
    private:
     friend class RolloutLeastSquares;
+    class DirectJacobian;
     struct Compiled {
       explicit Compiled(autodiff::Program program) : executable(std::move(program)), arena({&executable}) {}
       autodiff::Executable<double> executable;
@@ -56,13 +60,14 @@ class RolloutLeastSquares {
     std::optional<Compiled> encode_, rollout_, local_;
     Eigen::MatrixXd start_, first_input_, inputs_;       // what the programs read: columns step by step
     Eigen::MatrixXd carry_, carries_, next_, channels_;  // what the rollout writes
-    Eigen::MatrixXd values_;         // 𝓔, or [f; g], unused
-    Eigen::MatrixXd by_carry_;       // [F; C]: of every carry component one block of columns
-    Eigen::MatrixXd by_parameters_;  // ∂[f; g]/∂ω: of every component, tensor by tensor, columns
+    Eigen::VectorXd by_carry_;       // [F; C]: of every carry component one block of columns
+    Eigen::VectorXd by_parameters_, by_parameters_of_start_;     // what ∂[f; g]/∂ω and ∂𝓔/∂ω are made of
+    std::vector<std::vector<DirectTerm>> terms_, start_terms_;  // of every component, pointing there
     Eigen::MatrixXd sensitivity_, next_sensitivity_;  // S of every rollout side by side, unknowns × n each
-    Eigen::VectorXd direct_, factors_;                // of one component: by θ, zero beyond ω, and by the carry
-    Eigen::MatrixXd rows_;                            // weighted rows of J, as columns
-    Eigen::VectorXd residuals_;                       // weighted
+    Eigen::VectorXd factors_;                         // of one component by the carry
+    Eigen::MatrixXd rows_;       // weighted rows of J, as columns: all of them, or as many as are squared at a time
+    Eigen::VectorXd residuals_;  // weighted, beside them
+    bool holds_all_ = false;
   };
 
   /// Φ at a point. Infinite if a rollout leaves the numbers.
@@ -71,6 +76,13 @@ class RolloutLeastSquares {
               const LossData<double>& data, Workspace* workspace, Eigen::VectorXd* channel_squares = nullptr) const;
   void Linearise(const double* parameters, const Eigen::VectorXd& start, const Eigen::VectorXd& weights,
                  const LossData<double>& data, Workspace* workspace, NormalEquations* result) const;
+  /// Jᵀ W r″ with r″ = d²r(x + s δ)/ds² at s = 0: how the residuals bend along a direction, as the gradient sees it.
+  /// By a difference of residuals, at the price of one Cost.
+  /// @param parameters, start  at x + h δ. @param workspace  has just linearised at x, on the same data and weights.
+  /// @return nothing where the rollouts leave the numbers, or J was too large to be kept.
+  std::optional<Eigen::VectorXd> Bend(const double* parameters, const Eigen::VectorXd& start, double h,
+                                      const Eigen::VectorXd& direction, const Eigen::VectorXd& weights,
+                                      const LossData<double>& data, Workspace* workspace) const;
   /// Predictions of every channel, channels × (steps · rollouts), in the order of the set's columns.
   Eigen::MatrixXd Predictions(const double* parameters, const Eigen::VectorXd& start, const LossData<double>& data,
                               Workspace* workspace) const;

@@ -51,6 +51,30 @@ TEST(LevenbergMarquardtTest, FindsTheFloorOfRosenbrocksValley) {
   EXPECT_LT(result.iterations, 40);
 }
 
+TEST(LevenbergMarquardtTest, FollowsANarrowCurvedValleyWhereTheResidualsSayHowTheyBend) {
+  constexpr double kNarrow = 1e4;
+  Objective objective = LeastSquares([=](const VectorXd& x) {
+    VectorXd r(2);
+    r << kNarrow * (x[1] - x[0] * x[0]), 1 - x[0];
+    MatrixXd jacobian(2, 2);
+    jacobian << -2 * kNarrow * x[0], kNarrow, -1, 0;
+    return std::pair<VectorXd, MatrixXd>(r, jacobian);
+  });
+  const auto minimise = [&objective] {
+    return MinimiseLevenbergMarquardt(objective, Eigen::Vector2d(-1.2, 1), {.max_iterations = 1000, .tolerance = 1e-14}, nullptr);
+  };
+  const LevenbergMarquardtResult straight = minimise();
+  objective.bend = [=](const VectorXd& x, const VectorXd& direction, double) -> std::optional<VectorXd> {
+    const double r = -2 * kNarrow * direction[0] * direction[0];  // of the first residual; the second one is straight
+    return VectorXd(Eigen::Vector2d(-2 * kNarrow * x[0] * r, kNarrow * r));
+  };
+  const LevenbergMarquardtResult bent = minimise();
+  for (const LevenbergMarquardtResult* result : {&straight, &bent}) {
+    EXPECT_LT((result->x - Eigen::Vector2d(1, 1)).norm(), 1e-6);
+  }
+  EXPECT_LT(2 * bent.iterations, straight.iterations);
+}
+
 TEST(LevenbergMarquardtTest, NeverAcceptsWhatIsWorseOrNotANumber) {
   // √ is not defined where a full step from 4 would go.
   const Objective objective = LeastSquares([](const VectorXd& x) {

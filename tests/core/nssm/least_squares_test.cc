@@ -2,6 +2,8 @@
 
 #include <gtest/gtest.h>
 
+#include <limits>
+
 #include "tests/core/nssm/random_models.h"
 
 namespace metaekf::nssm {
@@ -109,6 +111,47 @@ TEST(LeastSquaresTest, PiecesOfLongRolloutsAndManyRolloutsAddUp) {
   Probe many(c, "*", false, 150, 1);  // more rollouts than run side by side
   EXPECT_GT(many.data.shape.rollouts, 64);
   ExpectNormalEquationsMatch(many);
+}
+
+TEST(LeastSquaresTest, BendsMatchSecondDifferencesForEveryKindOfModel) {
+  for (const ModelCase& c : ModelCases()) {
+    SCOPED_TRACE(c.name);
+    const bool free_start = c.model.is_case_one();
+    Probe probe(c, "*", free_start, 12, 1);
+    base::Rng rng(6);
+    VectorXd direction(probe.problem->unknowns());
+    for (double& value : direction) value = rng.Normal();
+    const auto at = [&](double step) {
+      std::vector<double> parameters = probe.parameters;
+      const VectorXd adapted = step * direction.head(probe.problem->adapted_size());
+      Index k = 0;
+      for (const auto& [offset, size] : probe.problem->adapted()) {
+        for (int64_t i = 0; i < size; ++i) parameters[static_cast<size_t>(offset + i)] += adapted[k++];
+      }
+      VectorXd start = probe.start;
+      if (free_start) start += step * direction.tail(start.size());
+      return std::pair(parameters, start);
+    };
+    constexpr double kWidth = 1e-4;
+    const auto [up, start_up] = at(kWidth);
+    const auto [down, start_down] = at(-kWidth);
+    const MatrixXd second = (probe.PredictionsAt(up, start_up) + probe.PredictionsAt(down, start_down) -
+                             2 * probe.PredictionsAt(probe.parameters, probe.start)) /
+                            (kWidth * kWidth);
+    VectorXd expected(direction.size());
+    for (Index i = 0; i < expected.size(); ++i) {
+      expected[i] = (probe.Slope(i).array() * (probe.weights.asDiagonal() * second).array()).sum();
+    }
+    probe.At(probe.parameters, probe.start);
+    const auto bend = [&](const std::vector<double>& parameters, const VectorXd& start, double h) {
+      return probe.problem->Bend(parameters.data(), start, h, direction, probe.weights, probe.data, &*probe.workspace);
+    };
+    const std::optional<VectorXd> forwards = bend(up, start_up, kWidth), backwards = bend(down, start_down, -kWidth);
+    ASSERT_TRUE(forwards.has_value() && backwards.has_value());
+    EXPECT_LT(((*forwards + *backwards) / 2 - expected).norm(), 1e-4 * expected.norm());  // the third derivative cancels
+    const std::vector<double> nowhere(up.size(), std::numeric_limits<double>::quiet_NaN());
+    EXPECT_FALSE(bend(nowhere, start_up, kWidth).has_value());
+  }
 }
 
 TEST(LeastSquaresTest, AMaskPicksUnknowns) {
