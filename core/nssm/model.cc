@@ -102,6 +102,7 @@ Value ModelGraph::Advance(Value latent, Value input) const {
   if (spec.form == TransitionForm::kAdditive && takes_input) {
     next = graph_->Add(model_.transition_input_.Apply(graph_, parameters_, input), next);
   }
+  next = graph_->Scale(next, spec.increment_scale);
   if (spec.bypass == Bypass::kSkip) next = graph_->Add(next, latent);
   if (spec.bypass == Bypass::kLinear) {
     if (takes_input) next = graph_->Add(next, graph_->MatMul(parameters_[model_.input_bypass_], input, true));

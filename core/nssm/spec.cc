@@ -71,6 +71,7 @@ TransitionSpec ReadTransition(JsonFields* parent) {
   spec.input_block = ReadBlock(&fields, "input_block");
   spec.bypass = fields.Choice("bypass", Bypass::kNone, kBypasses);
   spec.input_time = fields.Choice("input_time", InputTime::kCurrent, kInputTimes);
+  spec.increment_scale = fields.Number("increment_scale", 1, 1e-9, 1e9);
   parent->Include(fields.Finish());
   return spec;
 }
@@ -184,7 +185,8 @@ json ToJson(const ModelSpec& spec) {
   json transition = {{"block", BlockJson(spec.transition.block)},
                      {"form", NameOf(kForms, spec.transition.form)},
                      {"bypass", NameOf(kBypasses, spec.transition.bypass)},
-                     {"input_time", NameOf(kInputTimes, spec.transition.input_time)}};
+                     {"input_time", NameOf(kInputTimes, spec.transition.input_time)},
+                     {"increment_scale", spec.transition.increment_scale}};
   if (spec.transition.form == TransitionForm::kAdditive) {
     transition["input_block"] = BlockJson(spec.transition.input_block);
   }

@@ -26,6 +26,7 @@ struct TransitionSpec {
   TransitionForm form = TransitionForm::kJoint;
   Bypass bypass = Bypass::kNone;
   InputTime input_time = InputTime::kCurrent;
+  double increment_scale = 1;  // γ
 };
 
 /// What a model is: the message ModelSpec of spec.proto, where each field is described.

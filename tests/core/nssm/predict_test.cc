@@ -2,6 +2,8 @@
 
 #include <gtest/gtest.h>
 
+#include "absl/strings/match.h"
+#include "absl/strings/str_cat.h"
 #include "core/filter/filter_model.h"
 #include "tests/core/nssm/random_models.h"
 #include "tests/support/bundles.h"
@@ -32,6 +34,30 @@ VectorXd Window(const data::Trajectory& t, Index end, Index length, const data::
     }
   }
   return window;
+}
+
+TEST(PredictTest, TheIncrementScaleIsAFactorOnTheTransitionsLastLayers) {
+  for (ModelCase c : ModelCases()) {
+    SCOPED_TRACE(c.name);
+    const data::Trajectory t = RandomTrajectory(c.model, 15, 2);
+    c.model.transition.increment_scale = 0.25;
+    const Bundle scaled = SomeBundle(c);
+    c.model.transition.increment_scale = 1;
+    Bundle plain = scaled;
+    plain.model = *Model::Create(c.model);
+    for (const auto& [block, spec] : {std::pair("transition.", c.model.transition.block),
+                                      std::pair("transition_input.", c.model.transition.input_block)}) {
+      const std::string last = absl::StrCat(block, spec.hidden_widths.size(), ".");
+      for (const nn::Tensor& tensor : plain.model.layout().tensors()) {
+        if (!absl::StartsWith(tensor.name, last)) continue;
+        for (int64_t i = 0; i < tensor.size(); ++i) plain.parameters[static_cast<size_t>(tensor.offset + i)] *= 0.25;
+      }
+    }
+    const absl::StatusOr<Prediction> a = Predict(scaled, t, PredictionMode::kSimulate), b = Predict(plain, t, PredictionMode::kSimulate);
+    ASSERT_TRUE(a.ok() && b.ok());
+    const Index warmup = c.model.warmup(), judged = t.length() - warmup;
+    EXPECT_LT((a->outputs - b->outputs).rightCols(judged).norm(), 1e-11 * b->outputs.rightCols(judged).norm());
+  }
 }
 
 // Oracle: the filter's f and h called step by step, a code path without scans or batches.

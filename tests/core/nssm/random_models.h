@@ -49,6 +49,7 @@ inline std::vector<ModelCase> ModelCases() {
       spec.transition.form = form;
       spec.transition.bypass = bypass;
       if (bypass == Bypass::kLinear) spec.transition.input_time = InputTime::kNext;
+      if (bypass == Bypass::kSkip) spec.transition.increment_scale = 0.3;
       cases.push_back({"Case I" + suffix, spec, latent});
       spec = two;
       spec.transition.form = form;
