@@ -17,6 +17,7 @@ Result<Adaptation> Client::Adapt(const AdaptationRequest& request,
   options->set_require_better_than_arx(request.require_better_than_arx);
 
   using Stream = grpc::ClientReaderWriter<v1::AdaptRequest, v1::AdaptResponse>;
+  impl_->Connect();
   grpc::ClientContext context;
   const std::unique_ptr<Stream> stream = impl_->adaptations->Adapt(&context);
   const auto write = [&](Stream& out) {

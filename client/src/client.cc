@@ -6,9 +6,12 @@
 namespace metaekf::client {
 namespace {
 
+constexpr std::chrono::seconds kSecondChance(2);  // of a connection, the backoff before it included
+
 grpc::ChannelArguments Arguments() {
   grpc::ChannelArguments arguments;
   arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, 100);
+  arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, 2'000);
   // Finds half-open connections; servers end clients that ping more often than every 10 s.
   arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, 25'000);
   arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, 10'000);
@@ -62,6 +65,22 @@ Status Client::Impl::Translate(const grpc::Status& status) const {
                      " is no metaekf server, or one of another version (" + result.message + ")";
   }
   return result;
+}
+
+void Client::Impl::Connect() const {
+  using std::chrono::system_clock;
+  const auto deadline = system_clock::now() + std::chrono::microseconds(std::llround(1e6 * options.timeout_s));
+  auto state = channel->GetState(true);
+  while (state == GRPC_CHANNEL_IDLE || state == GRPC_CHANNEL_CONNECTING) {
+    if (!channel->WaitForStateChange(state, deadline)) return;
+    state = channel->GetState(true);
+  }
+  if (state != GRPC_CHANNEL_TRANSIENT_FAILURE) return;
+  grpc::ClientContext context;
+  SetDeadline(context);
+  v1::ServerInfo info;
+  const Status why = Translate(server->GetServerInfo(&context, v1::GetServerInfoRequest(), &info));
+  if (why.reason == "NO_CONNECTION") channel->WaitForStateChange(state, system_clock::now() + kSecondChance);
 }
 
 void Client::Impl::SetDeadline(grpc::ClientContext& context) const {

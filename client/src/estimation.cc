@@ -49,6 +49,7 @@ uint64_t LastSeq(const v1::SampleBatch& batch, size_t output_size) {
 
 Status EstimationSession::Impl::Connect(const v1::EstimateRequest& first) {
   stream.reset();
+  client->Connect();
   context = std::make_unique<grpc::ClientContext>();
   stream = client->estimation->Estimate(context.get());
   v1::EstimateResponse response;

@@ -46,6 +46,7 @@ struct Client::Impl {
   Status Call(const std::unique_ptr<Service>& service,
               grpc::Status (Service::*method)(grpc::ClientContext*, const Request&, Response*),
               const Request& request, Response* response) const {
+    Connect();
     grpc::ClientContext context;
     SetDeadline(context);
     return Translate((service.get()->*method)(&context, request, response));
@@ -94,6 +95,11 @@ struct Client::Impl {
   }
 
   void SetDeadline(grpc::ClientContext& context) const;
+
+  /// Gives the channel a second chance to connect where the first failed for no good reason; whatever comes of it, the next
+  /// call says. To be called before every call: gRPC 1.51 takes some connections in the making for failed, for it looks at
+  /// the errno of connect() after other system calls.
+  void Connect() const;
 
   Options options;
   std::shared_ptr<grpc::Channel> channel;

@@ -57,6 +57,7 @@ Result<ModelVersion> Client::GetModelVersion(const std::string& model) {
 Result<std::string> Client::ExportModel(const std::string& model) {
   v1::ExportModelVersionRequest request;
   METAEKF_CLIENT_ASSIGN_OR_RETURN(*request.mutable_name(), ModelResource(model));
+  impl_->Connect();
   grpc::ClientContext context;
   const auto stream = impl_->models->ExportModelVersion(&context, request);
   v1::ModelVersion header;
@@ -81,6 +82,7 @@ Result<ModelVersion> Client::ImportModel(const std::string& model, const std::st
   header->set_size_bytes(file.size());
   header->set_sha256(Sha256Hex(file));
 
+  impl_->Connect();
   grpc::ClientContext context;
   v1::ModelVersion response;
   const auto stream = impl_->models->ImportModelVersion(&context, &response);

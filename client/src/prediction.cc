@@ -12,6 +12,7 @@ Result<std::vector<Prediction>> Client::Predict(
                                        : v1::PredictRequest::SIMULATE);
 
   using Stream = grpc::ClientReaderWriter<v1::PredictRequest, v1::PredictResponse>;
+  impl_->Connect();
   grpc::ClientContext context;
   const std::unique_ptr<Stream> stream = impl_->predictions->Predict(&context);
   const auto write = [&](Stream& out) {

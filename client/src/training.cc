@@ -24,6 +24,7 @@ Result<Job> Client::CreateTrainingJob(const TrainingRequest& request) {
   ToProto(request.channels, header->mutable_channels());
   header->set_request_id(request.request_id);
 
+  impl_->Connect();
   grpc::ClientContext context;
   v1::Job response;
   const auto stream = impl_->training->CreateTrainingJob(&context, &response);
@@ -62,6 +63,7 @@ Result<Job> Client::WatchJob(const std::string& id,
   METAEKF_CLIENT_ASSIGN_OR_RETURN(Job job, GetJob(id));
   v1::WatchJobRequest request;
   request.set_name("jobs/" + job.id);
+  impl_->Connect();
   grpc::ClientContext context;
   const auto stream = impl_->training->WatchJob(&context, request);
   v1::WatchJobResponse response;

@@ -1,6 +1,7 @@
 #include "tests/client/fake_server.h"
 
 #include <grpcpp/grpcpp.h>
+#include <grpcpp/server_posix.h>
 
 #include <algorithm>
 #include <chrono>
@@ -430,6 +431,8 @@ FakeServer::FakeServer() : services_(std::make_unique<Services>(*this)) {
 }
 
 FakeServer::~FakeServer() { Stop(); }
+
+void FakeServer::Serve(int connection) { grpc::AddInsecureChannelFromFd(services_->server.get(), connection); }
 
 void FakeServer::Stop() { services_->server->Shutdown(std::chrono::system_clock::now()); }
 

@@ -89,6 +89,8 @@ class FakeServer {
   void Stop();
   /// HOST:PORT
   const std::string& address() const { return address_; }
+  /// Serves a connection that somebody else has accepted.
+  void Serve(int connection);
 
   FakeModels models;
   FakeTraining training;

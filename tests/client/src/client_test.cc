@@ -1,9 +1,14 @@
 #include "metaekf/client.h"
 
+#include <fcntl.h>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
+#include <netinet/in.h>
+#include <sys/socket.h>
+#include <unistd.h>
 
 #include <cmath>
+#include <thread>
 
 #include "google/rpc/error_details.pb.h"
 #include "tests/client/fake_server.h"
@@ -36,6 +41,29 @@ TEST(ClientWithoutServerTest, SaysWhereNoServerIs) {
   EXPECT_EQ(status.code, Code::kUnavailable);
   EXPECT_EQ(status.reason, "NO_SERVER");
   EXPECT_EQ(status.message, "no server at " + address);
+}
+
+TEST_F(ClientTest, TriesAConnectionThatFailsASecondTime) {
+  const int listener = socket(AF_INET, SOCK_STREAM, 0);
+  sockaddr_in address{.sin_family = AF_INET};
+  address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+  socklen_t size = sizeof(address);
+  ASSERT_EQ(bind(listener, reinterpret_cast<const sockaddr*>(&address), size), 0);
+  ASSERT_EQ(listen(listener, 2), 0);
+  ASSERT_EQ(getsockname(listener, reinterpret_cast<sockaddr*>(&address), &size), 0);
+  std::thread network([&] {
+    close(accept(listener, nullptr, nullptr));
+    const int connection = accept(listener, nullptr, nullptr);
+    if (connection < 0) return;  // there was no second attempt
+    EXPECT_EQ(fcntl(connection, F_SETFL, O_NONBLOCK), 0);
+    server_.Serve(connection);
+  });
+  Client client({.server = "127.0.0.1:" + std::to_string(ntohs(address.sin_port))});
+  const auto models = client.ListModels();
+  EXPECT_TRUE(models.ok()) << models.status().message;
+  shutdown(listener, SHUT_RDWR);  // wakes a thread that waits in vain
+  network.join();
+  close(listener);
 }
 
 TEST_F(ClientTest, ReadsWhatTheServerSaysOfItself) {
