@@ -11,6 +11,7 @@
 #include "core/meta/fit_plan.h"
 #include "core/meta/inner_loop.h"
 #include "core/meta/proximal_fit.h"
+#include "core/meta/scratch_fit.h"
 #include "core/nssm/loss.h"
 
 namespace metaekf::meta {
@@ -188,7 +189,7 @@ absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const Pr
   };
   METAEKF_ASSIGN_OR_RETURN(
       SystemFit fit, options.method == AdaptationMethod::kFromScratch
-                         ? FitFromScratch(plan, bundle.model, problem.loss, context, {.seed = options.seed, .steps = steps}, tell)
+                         ? FitFromScratch(plan, bundle.model, problem.loss, context, {.seed = options.seed, .steps = steps, .stop_early = true}, tell)
                          : FitSystem(plan, prior, bundle.parameters, context, {.steps = steps, .tolerance = problem.tolerance, .from = problem.from}, tell));
   if (stopped) return absl::CancelledError("the adaptation was cancelled");
   FitResult result{.parameters = std::move(fit.parameters),

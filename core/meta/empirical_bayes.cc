@@ -10,6 +10,7 @@
 #include "core/linalg/decompositions.h"
 #include "core/meta/covariance_structure.h"
 #include "core/meta/fit_plan.h"
+#include "core/meta/scratch_fit.h"
 
 namespace metaekf::meta {
 namespace {

@@ -1,12 +1,10 @@
 #include "core/meta/fit_plan.h"
 
 #include <algorithm>
-#include <atomic>
 #include <cmath>
 
 #include "core/base/status.h"
 #include "core/data/split.h"
-#include "core/meta/linear_start.h"
 
 namespace metaekf::meta {
 
@@ -27,9 +25,6 @@ constexpr int kContenderSteps = 7;
 constexpr double kContenderTolerance = 1e-3;
 constexpr double kWarmDamping = 1e-2;      // of a fit from parameters that have been learned
 constexpr double kContinuedDamping = 1e-4; // of a fit that goes on from one to fewer samples of the system
-constexpr double kFromScratchPrecision = 1e-6;  // knows nothing
-constexpr double kFromScratchTolerance = 1e-5;
-constexpr int kHorizonGrowth = 4;          // from one stage to the next
 
 VectorXd MeanOf(const RolloutLeastSquares& problem, const std::vector<double>& mean) {
   VectorXd unknowns = VectorXd::Zero(problem.unknowns());
@@ -160,66 +155,6 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
                        .noise_samples = options.noise_samples},
                       &workspace, tell);
   ScatterAdapted(plan.dynamics, result.fit.unknowns, &result.parameters);
-  return result;
-}
-
-absl::StatusOr<SystemFit> FitFromScratch(const FitPlan& plan, const nssm::Model& model, const nssm::LossSpec& loss,
-                                         const Trajectory& normalised, const FromScratchOptions& options,
-                                         const std::function<bool(int, double)>& on_step, base::Executor* executor) {
-  METAEKF_ASSIGN_OR_RETURN(const LossData<double> whole, plan.dynamics.Cut(normalised));
-  const Index n = plan.dynamics.unknowns(), channels = plan.dynamics.channels();
-  VectorXd weights = VectorXd::Constant(channels, loss.output_weight);
-  weights.head(channels - model.spec().output_size).setConstant(loss.state_weight);
-  const Belief belief{.mean = VectorXd::Zero(n),
-                      .precision = kFromScratchPrecision * MatrixXd::Identity(n, n),
-                      .noise_variance = weights.cwiseInverse()};
-  const MapFitOptions fit_options{.optimiser = {.max_iterations = options.steps, .tolerance = kFromScratchTolerance}};
-  std::vector<SystemFit> fits(static_cast<size_t>(options.restarts));
-  std::atomic<bool> stopped = false;
-  const auto tell = [&](int step, double cost) {
-    if (on_step && !on_step(step, cost)) stopped = true;
-    return !stopped.load();
-  };
-  const std::function<bool(int, double)> quiet;
-  const auto run = [&](size_t i, const std::function<bool(int, double)>& told) {
-    const uint64_t seed = options.seed + i;
-    const absl::StatusOr<std::vector<double>> linear = LinearStart(model, normalised, seed);
-    fits[i].parameters = linear.ok() ? *linear : model.InitialParameters(seed);
-    VectorXd unknowns = MeanOf(plan.dynamics, fits[i].parameters);
-    const auto fit = [&](const RolloutLeastSquares& problem, const LossData<double>& data) {
-      RolloutLeastSquares::Workspace workspace(problem, data.shape);
-      fits[i].fit = FitMap(problem, data, fits[i].parameters, belief, unknowns, fit_options, &workspace, told);
-      unknowns = fits[i].fit.unknowns;
-    };
-    if (!plan.start) {
-      nssm::LossSpec shorter = loss;
-      for (shorter.horizon = 1; shorter.horizon < whole.shape.horizon && !stopped; shorter.horizon *= kHorizonGrowth) {
-        const RolloutLeastSquares problem(model, shorter, plan.dynamics.mask(), false);
-        const absl::StatusOr<LossData<double>> data = problem.Cut(normalised);
-        if (data.ok()) fit(problem, *data);
-      }
-    }
-    fit(plan.dynamics, whole);
-    ScatterAdapted(plan.dynamics, unknowns, &fits[i].parameters);
-  };
-  if (executor != nullptr) {
-    executor->ParallelFor(fits.size(), [&](size_t i, size_t) { run(i, quiet); });
-  } else {
-    for (size_t i = 0; i < fits.size() && !stopped; ++i) run(i, tell);
-  }
-  const SystemFit* best = nullptr;
-  for (const SystemFit& fit : fits) {
-    const bool usable = fit.fit.unknowns.size() > 0 && std::isfinite(fit.fit.cost);
-    if (usable && (best == nullptr || fit.fit.cost < best->fit.cost)) best = &fit;
-  }
-  if (best == nullptr) {
-    return absl::OutOfRangeError("no start of the fit simulates the system; shorter rollouts or another seed may help");
-  }
-  SystemFit result = *best;
-  const double samples = static_cast<double>(whole.shape.rollouts) * whole.shape.horizon;
-  for (Index c = 0; c < channels; ++c) {
-    if (weights[c] > 0) result.fit.noise_variance[c] = result.fit.channel_squares[c] / samples;
-  }
   return result;
 }
 

@@ -3,7 +3,6 @@
 #include <optional>
 #include <vector>
 
-#include "core/base/executor.h"
 #include "core/meta/map_fit.h"
 #include "core/nssm/prior.h"
 
@@ -49,22 +48,5 @@ struct SystemFitOptions {
 absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const nssm::GaussianPrior& prior, const std::vector<double>& mean,
                                     const data::Trajectory& normalised, const SystemFitOptions& options,
                                     const std::function<bool(int, double)>& on_step);
-
-struct FromScratchOptions {
-  uint64_t seed = 0;
-  int32_t restarts = 6;
-  int32_t steps = 60;
-};
-
-/// Fits a system of which nothing is known: the best of several starts, each a linear model of the recording (LinearStart)
-/// where the model has the form for it, else random. Rollouts from measured or encoded starts grow to their full length.
-/// Residuals count as the loss weighs them; the noise variance that comes out is theirs.
-///
-/// @param executor  runs the restarts; nullptr: one after the other.
-/// Errors: as those of FitSystem.
-absl::StatusOr<SystemFit> FitFromScratch(const FitPlan& plan, const nssm::Model& model, const nssm::LossSpec& loss,
-                                         const data::Trajectory& normalised, const FromScratchOptions& options,
-                                         const std::function<bool(int, double)>& on_step,
-                                         base::Executor* executor = nullptr);
 
 }  // namespace metaekf::meta

@@ -71,7 +71,7 @@ MapFit FitMap(const RolloutLeastSquares& problem, const LossData<double>& data, 
     return 0.5 * d.dot(belief.precision.selfadjointView<Eigen::Lower>() * d);
   };
   NormalEquations equations;
-  Objective objective;
+  Objective objective;  // linearised where the fit stands, and nowhere else
   objective.cost = [&](const VectorXd& x) {
     place(x);
     return problem.Cost(all.data(), start, weights, data, workspace) + penalty(x);
@@ -82,6 +82,7 @@ MapFit FitMap(const RolloutLeastSquares& problem, const LossData<double>& data, 
     model->cost = equations.cost + penalty(x);
     model->gradient = equations.gradient + belief.precision.selfadjointView<Eigen::Lower>() * (x - belief.mean);
     model->curvature = equations.curvature + belief.precision;
+    if (options.inspect) options.inspect(x);
   };
   objective.bend = [&](const VectorXd& x, const VectorXd& direction, double h) {  // the prior's residuals are straight
     place(x + h * direction);

@@ -34,6 +34,8 @@ struct MapFitOptions {
   LevenbergMarquardtOptions optimiser;
   /// How many samples' worth of evidence the belief's noise variance counts for; infinite: it is not estimated.
   double noise_samples = std::numeric_limits<double>::infinity();
+  /// Sees the unknowns before the first step and after every one.
+  std::function<void(const Eigen::VectorXd&)> inspect;
 };
 
 /// Minimises ½ Σ_c Σ r_c²/σ_c² + ½ (θ − m)ᵀ Λ (θ − m) over the unknowns θ.

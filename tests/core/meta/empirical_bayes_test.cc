@@ -13,7 +13,7 @@
 #include "core/meta/adapt.h"
 #include "core/meta/arx.h"
 #include "core/meta/covariance_structure.h"
-#include "core/meta/fit_plan.h"
+#include "core/meta/scratch_fit.h"
 #include "core/meta/train.h"
 #include "core/nssm/model_file.h"
 #include "core/nssm/predict.h"

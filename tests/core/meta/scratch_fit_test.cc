@@ -1,0 +1,93 @@
+#include "core/meta/scratch_fit.h"
+
+#include <gtest/gtest.h>
+
+#include <Eigen/Geometry>
+#include <cmath>
+
+#include "core/base/rng.h"
+#include "core/data/split.h"
+
+namespace metaekf::meta {
+namespace {
+
+using data::Trajectory;
+using Eigen::Index;
+using Eigen::MatrixXd;
+
+constexpr int64_t kFuture = 300;  // samples after the context
+
+/// A damped resonator, bent a little. @param clean  its outputs without noise.
+Trajectory Resonator(int64_t length, double noise, uint64_t seed, MatrixXd* clean) {
+  base::Rng rng(seed), of_noise(seed, 1);
+  const double angle = rng.Uniform(0.3, 0.5), radius = rng.Uniform(0.9, 0.95);
+  Trajectory t{.name = "resonator", .sample_period_s = 0.1};
+  t.inputs.resize(1, length);
+  t.outputs.resize(1, length);
+  t.states.resize(0, length);
+  Eigen::Vector2d x = Eigen::Vector2d::Zero();
+  for (Index k = 0; k < length; ++k) {
+    t.inputs(0, k) = rng.Normal();
+    const Eigen::Rotation2D<double> rotation(angle);
+    x = radius * (rotation * x);
+    x[0] += t.inputs(0, k);
+    x[1] -= 0.2 * std::tanh(x[0]);
+    t.outputs(0, k) = x[0];
+  }
+  *clean = t.outputs;
+  for (Index k = 0; k < length; ++k) t.outputs(0, k) += noise * of_noise.Normal();
+  return t;
+}
+
+struct Errors {
+  double to_minimum, stopped_early;
+};
+
+/// Root mean square errors of fits to the first samples, in free run over the kFuture that follow.
+Errors ErrorsAfter(int64_t context_samples, double noise, uint64_t seed) {
+  nssm::ModelSpec spec;
+  spec.input_size = spec.output_size = 1;
+  spec.state_size = 0;
+  spec.latent_size = 3;
+  spec.window = 6;
+  spec.transition.bypass = nssm::Bypass::kLinear;
+  spec.transition.input_time = nssm::InputTime::kNext;
+  spec.transition.block.hidden_widths = {8};
+  spec.transition.block.output_scale = 0.1;
+  spec.precision = nssm::Precision::kFloat64;
+  spec.start = nssm::StartMode::kFitted;
+  const nssm::LossSpec loss{.horizon = nssm::LossSpec::kWholeSet, .state_weight = 0, .reconstruction_weight = 0};
+  const nssm::Model model = *nssm::Model::Create(spec);
+  const FitPlan plan(model, loss, nn::Mask(model.layout().tensors().size(), true));
+  MatrixXd clean;
+  const Trajectory recording = Resonator(context_samples + kFuture, noise, seed, &clean);
+  const Trajectory context = *data::FirstSamples(recording, context_samples);
+  const auto error = [&](bool stop_early) {
+    const SystemFit fit = *FitFromScratch(plan, model, loss, context, {.seed = seed, .stop_early = stop_early}, nullptr);
+    const nssm::LossData<double> data = *plan.dynamics.Cut(recording);
+    nssm::RolloutLeastSquares::Workspace workspace(plan.dynamics, data.shape);
+    const MatrixXd predictions = plan.dynamics.Predictions(fit.parameters.data(), fit.fit.unknowns.tail(plan.dynamics.carry_size()), data, &workspace);
+    return std::sqrt((predictions.rightCols(kFuture) - clean.rightCols(kFuture)).squaredNorm() / kFuture);
+  };
+  return {error(false), error(true)};
+}
+
+// 90 parameters, 80 samples: the minimum has learned the noise by heart.
+TEST(ScratchFitTest, StoppingEarlyPredictsBetterAfterAFewNoisySamples) {
+  double gained = 0;
+  for (uint64_t seed = 1; seed <= 5; ++seed) {
+    const Errors errors = ErrorsAfter(80, 0.4, seed);
+    gained += std::log(errors.to_minimum / errors.stopped_early);
+  }
+  EXPECT_GT(gained / 5, std::log(1.5));
+}
+
+// There is nothing to stop for: the fit goes on to the minimum of all samples, those that were held out too.
+TEST(ScratchFitTest, StoppingEarlyTakesNothingFromAnExactFit) {
+  const Errors errors = ErrorsAfter(500, 1e-4, 1);
+  EXPECT_LT(errors.to_minimum, 1e-3);
+  EXPECT_LT(errors.stopped_early, 1.2 * errors.to_minimum);
+}
+
+}  // namespace
+}  // namespace metaekf::meta
