@@ -189,8 +189,8 @@ absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const Pr
   };
   METAEKF_ASSIGN_OR_RETURN(
       SystemFit fit, options.method == AdaptationMethod::kFromScratch
-                         ? FitFromScratch(plan, bundle.model, problem.loss, context, {.seed = options.seed, .steps = steps, .stop_early = true}, tell)
-                         : FitSystem(plan, prior, bundle.parameters, context, {.steps = steps, .tolerance = problem.tolerance, .from = problem.from}, tell));
+                         ? FitFromScratch(plan, bundle.model, problem.loss, context, {.seed = options.seed, .steps = steps, .stop_early = true, .executor = options.executor}, tell)
+                         : FitSystem(plan, prior, bundle.parameters, context, {.steps = steps, .tolerance = problem.tolerance, .from = problem.from, .executor = options.executor}, tell));
   if (stopped) return absl::CancelledError("the adaptation was cancelled");
   FitResult result{.parameters = std::move(fit.parameters),
                    .posterior = PosteriorOf(fit.fit.information, plan.dynamics.adapted_size()),

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "absl/status/statusor.h"
+#include "core/base/executor.h"
 #include "core/data/trajectory.h"
 #include "core/meta/training_spec.h"
 #include "core/nssm/bundle.h"
@@ -25,6 +26,7 @@ struct AdaptationOptions {
   AdaptationMethod method = AdaptationMethod::kGradientDescent;
   InnerLoopSpec inner_loop;
   uint64_t seed = 0;  ///< of the random initialisation
+  base::Executor* executor = nullptr;  ///< runs starts that compete; nullptr: one after the other. Changes no result
 };
 
 /// What `adapt` does with a model unless told otherwise. Without a method: what its training specification says. The

@@ -120,7 +120,7 @@ class Learner {
     METAEKF_ASSIGN_OR_RETURN(
         const SystemFit first,
         FitFromScratch(plan_, model_, spec_.loss, systems_.training[0],
-                       {.seed = spec_.seed, .restarts = options_.restarts, .steps = options_.first_steps}, nullptr, &executor_));
+                       {.seed = spec_.seed, .restarts = options_.restarts, .steps = options_.first_steps, .executor = &executor_}, nullptr));
     const Index p = plan_.dynamics.adapted_size(), n = first.fit.unknowns.size() - p;
     start_ = first.parameters;
     Belief& belief = population_.belief;

@@ -1,7 +1,10 @@
 #include "core/meta/fit_plan.h"
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
+#include <memory>
+#include <mutex>
 
 #include "core/base/status.h"
 #include "core/data/split.h"
@@ -123,7 +126,6 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
   METAEKF_RETURN_IF_ERROR(plan.CheckPrior(prior));
   const Belief belief = plan.BeliefOf(prior, mean);
   METAEKF_ASSIGN_OR_RETURN(const LossData<double> data, plan.dynamics.Cut(normalised));
-  RolloutLeastSquares::Workspace workspace(plan.dynamics, data.shape);
   std::vector<Candidate> candidates{{.unknowns = options.from, .damping = kContinuedDamping}};
   if (options.from.size() == 0) {
     METAEKF_ASSIGN_OR_RETURN(candidates, Screen(plan, prior, mean, belief, normalised));
@@ -132,20 +134,29 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
     return absl::OutOfRangeError("the fit diverged: neither the meta-learned parameters nor any example simulate this system");
   }
   SystemFit result{.parameters = mean};
-  bool stopped = false;
+  std::mutex telling;
+  std::atomic<bool> stopped = false;
   const auto tell = [&](int step, double cost) {
-    stopped = on_step && !on_step(step, cost);
-    return !stopped;
+    const std::lock_guard lock(telling);
+    if (!stopped && on_step && !on_step(step, cost)) stopped = true;
+    return !stopped.load();
+  };
+  const std::unique_ptr<base::Executor> serial = base::MakeSerialExecutor();
+  base::Executor& executor = options.executor != nullptr ? *options.executor : *serial;
+  std::vector<std::unique_ptr<RolloutLeastSquares::Workspace>> workspaces(executor.concurrency());
+  const auto workspace = [&](size_t slot) {
+    if (!workspaces[slot]) workspaces[slot] = std::make_unique<RolloutLeastSquares::Workspace>(plan.dynamics, data.shape);
+    return workspaces[slot].get();
   };
   if (candidates.size() > 1) {
-    for (Candidate& candidate : candidates) {
-      const MapFit fit = FitMap(plan.dynamics, data, mean, belief, candidate.unknowns,
+    executor.ParallelFor(candidates.size(), [&](size_t i, size_t slot) {
+      if (stopped) return;
+      const MapFit fit = FitMap(plan.dynamics, data, mean, belief, candidates[i].unknowns,
                                 {.optimiser = {.max_iterations = std::min(kContenderSteps, options.steps),
                                                .tolerance = kContenderTolerance}},
-                                &workspace, tell);
-      candidate = {fit.cost, fit.unknowns, fit.damping};
-      if (stopped) break;
-    }
+                                workspace(slot), tell);
+      candidates[i] = {fit.cost, fit.unknowns, fit.damping};
+    });
     std::stable_sort(candidates.begin(), candidates.end(), Cheaper);
   }
   result.fit = FitMap(plan.dynamics, data, mean, belief, candidates[0].unknowns,
@@ -153,7 +164,7 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
                                      .tolerance = options.tolerance,
                                      .initial_damping = candidates[0].damping},
                        .noise_samples = options.noise_samples},
-                      &workspace, tell);
+                      workspace(0), tell);
   ScatterAdapted(plan.dynamics, result.fit.unknowns, &result.parameters);
   return result;
 }

@@ -3,6 +3,7 @@
 #include <optional>
 #include <vector>
 
+#include "core/base/executor.h"
 #include "core/meta/map_fit.h"
 #include "core/nssm/prior.h"
 
@@ -34,6 +35,7 @@ struct SystemFitOptions {
   double noise_samples = 200;
   /// Unknowns of a fit to the head of the same recording: the fit goes on from them alone. Empty: it looks for a start.
   Eigen::VectorXd from;
+  base::Executor* executor = nullptr;  ///< runs starts that compete; nullptr: one after the other
 };
 
 /// Fits a system under a prior.
@@ -43,7 +45,8 @@ struct SystemFitOptions {
 ///
 /// @param mean        ω₀.
 /// @param normalised  the context, in normalised units.
-/// @param on_step     called with (step, Φ) after every step of the fits; false stops, with the best so far.
+/// @param on_step     called with (step, Φ) after every step of the fits, by one thread at a time; false stops, with the
+///                    best so far.
 /// Errors: FailedPrecondition if the context is too short; OutOfRange if no start gives a finite cost.
 absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const nssm::GaussianPrior& prior, const std::vector<double>& mean,
                                     const data::Trajectory& normalised, const SystemFitOptions& options,

@@ -4,6 +4,10 @@
 #include <cmath>
 #include <limits>
 
+#include <Eigen/Core>
+
+#include "core/base/rng.h"
+
 namespace metaekf::meta {
 
 using nssm::LossData;
@@ -12,6 +16,7 @@ using nssm::LossShape;
 namespace {
 
 constexpr int kSettlingSteps = 10;  // of Newton, at most
+constexpr int kPowerSteps = 30;
 constexpr double kSettled = 0.25;   // of the last squared slope: one that falls no further is down to rounding
 
 nn::Mask AllOf(const nssm::Model& model) { return nn::Mask(model.layout().tensors().size(), true); }
@@ -150,6 +155,29 @@ template <typename T>
 double MetaGradient<T>::TargetLoss(const T* variables, const LossData<T>& context, const LossData<T>& target,
                                    Scratch* scratch) const {
   return target_.Value(Adapt(variables, context, scratch), target, scratch->target_);
+}
+
+template <typename T>
+std::vector<double> MetaGradient<T>::Curvatures(const T* variables, const LossData<T>& context, Scratch* scratch) const {
+  using Vector = Eigen::Matrix<T, Eigen::Dynamic, 1>;
+  std::vector<double> curvatures;
+  Vector v(size_), product(size_);
+  base::Rng rng(0);
+  for (const auto& [offset, size] : loop_.adapted()) {
+    v.setZero();
+    for (int64_t i = offset; i < offset + size; ++i) v[i] = static_cast<T>(rng.Normal());
+    double curvature = 0;
+    for (int step = 0; step < kPowerSteps; ++step) {
+      const T length = v.norm();
+      if (!(length > 0)) break;  // no curvature, or none that is a number
+      v /= length;
+      inner_.HessianVector(variables, context, v.data(), product.data(), scratch->inner_);
+      v.segment(offset, size) = product.segment(offset, size);
+      curvature = static_cast<double>(v.norm());
+    }
+    curvatures.push_back(curvature);
+  }
+  return curvatures;
 }
 
 template <typename T>

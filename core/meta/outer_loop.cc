@@ -20,6 +20,7 @@ using nssm::LossData;
 using nssm::LossShape;
 
 constexpr int kValidationDraws = 2;          // context and target sets per held-out system
+constexpr int kCurvatureSystems = 16;
 constexpr double kTrainingLossWeight = 0.1;  // of the newest step in the running mean
 constexpr double kHopeless = 1e6;            // times the first loss: from there no training comes back
 
@@ -84,6 +85,22 @@ class Phase {
     return loss;
   }
 
+  /// Of every adapted tensor the largest curvature of the context loss that any of kCurvatureSystems systems has.
+  std::vector<double> Curvatures(const std::vector<double>& at) {
+    const std::vector<T> parameters(at.begin(), at.end());
+    std::vector<std::vector<double>> of_systems(kCurvatureSystems);
+    executor_->ParallelFor(of_systems.size(), [&](size_t index, size_t slot) {
+      base::Rng rng(~spec_.seed, (uint64_t{1} << 32) + index);
+      const Trajectory& system = systems_.training[rng.Index(systems_.training.size())];
+      of_systems[index] = meta_gradient_.Curvatures(parameters.data(), DrawContext(system, &rng), &scratch_[slot]);
+    });
+    std::vector<double> largest = of_systems.front();
+    for (const std::vector<double>& own : of_systems) {
+      for (size_t l = 0; l < largest.size(); ++l) largest[l] = std::max(largest[l], own[l]);
+    }
+    return largest;
+  }
+
   /// Mean loss over the held-out systems, on the same sets every time, so that iterations compare.
   double ValidationLoss(const std::vector<double>& at) {
     const std::vector<T> parameters(at.begin(), at.end());
@@ -105,6 +122,7 @@ class Phase {
     return nssm::CutLossData<T>(spec_.model, spec_.loss, system, static_cast<int64_t>(rng->Index(places)), shape);
   }
   LossData<T> DrawContext(const Trajectory& system, base::Rng* rng) const {
+    if (spec_.contexts_at_start) return nssm::CutLossData<T>(spec_.model, spec_.loss, system, 0, context_shape_);
     return Draw(system, spec_.context_samples, context_shape_, rng);
   }
   LossData<T> DrawTarget(const Trajectory& system, base::Rng* rng) const {
@@ -283,6 +301,7 @@ class OuterLoop {
       // Another loss: the warm-up's squared gradients would throttle the first thousand steps on it.
       std::fill(first_moment.begin(), first_moment.end(), 0.0);
       std::fill(second_moment.begin(), second_moment.end(), 0.0);
+      if (spec_.inner_loop.curvature_rates) ScaleRates(main_.Curvatures(parameters), &parameters);
     }
     const double loss = (warming_up ? *warmup_ : main_).Gradient(iteration, parameters, &gradient_);
     const double norm = ClipNorm(spec_.clip_norm, &gradient_);
@@ -302,6 +321,15 @@ class OuterLoop {
     AdamStep(gradient_, step, rate, &first_moment, &second_moment, &parameters);
     nssm::RoundToPrecision(spec_.model.precision, &parameters);
     return absl::OkStatus();
+  }
+
+  /// Rates that have stood for multiples of 1/λ become those: the loss is that of the main phase from here on.
+  void ScaleRates(const std::vector<double>& curvatures, std::vector<double>* variables) const {
+    const size_t first = variables->size() - curvatures.size();
+    for (size_t l = 0; l < curvatures.size(); ++l) {
+      if (curvatures[l] > 0) (*variables)[first + l] -= std::log(curvatures[l]);
+    }
+    nssm::RoundToPrecision(spec_.model.precision, variables);
   }
 
   void Validate() {

@@ -4,6 +4,8 @@
 #include <atomic>
 #include <cmath>
 #include <limits>
+#include <memory>
+#include <mutex>
 
 #include "core/base/status.h"
 #include "core/data/split.h"
@@ -137,21 +139,26 @@ struct Start {
 
 absl::StatusOr<SystemFit> FitFromScratch(const FitPlan& plan, const nssm::Model& model, const nssm::LossSpec& loss,
                                          const Trajectory& normalised, const FromScratchOptions& options,
-                                         const OnStep& on_step, base::Executor* executor) {
+                                         const OnStep& on_step) {
   METAEKF_ASSIGN_OR_RETURN(const LossData<double> whole, plan.dynamics.Cut(normalised));
   const ScratchFits fits(plan, model, loss, options);
   absl::StatusOr<HeldOut> held_out = absl::FailedPreconditionError("not asked for");
   if (options.stop_early) held_out = HoldOut(plan, model, normalised);  // a recording too short for that is fitted whole
   std::vector<Start> starts(static_cast<size_t>(options.restarts));
+  std::mutex telling;
   std::atomic<bool> stopped = false;
   const OnStep tell = [&](int step, double cost) {
-    if (on_step && !on_step(step, cost)) stopped = true;
+    const std::lock_guard lock(telling);
+    if (!stopped && on_step && !on_step(step, cost)) stopped = true;
     return !stopped.load();
   };
-  const auto run = [&](size_t i, const OnStep& told) {
+  const std::unique_ptr<base::Executor> serial = base::MakeSerialExecutor();
+  base::Executor& executor = options.executor != nullptr ? *options.executor : *serial;
+  executor.ParallelFor(starts.size(), [&](size_t i, size_t) {
+    if (stopped) return;
     Start& start = starts[i];
     if (!held_out.ok()) {
-      start.fit = fits.Fit(i, normalised, whole, nullptr, told);
+      start.fit = fits.Fit(i, normalised, whole, nullptr, tell);
       start.cost = start.fit.fit.cost;
       return;
     }
@@ -162,13 +169,8 @@ absl::StatusOr<SystemFit> FitFromScratch(const FitPlan& plan, const nssm::Model&
       start.cost = start.last_cost;
       start.unknowns = unknowns;
     };
-    start.fit = fits.Fit(i, held_out->head, held_out->head_data, inspect, told);
-  };
-  if (executor != nullptr) {
-    executor->ParallelFor(starts.size(), [&](size_t i, size_t) { run(i, nullptr); });
-  } else {
-    for (size_t i = 0; i < starts.size() && !stopped; ++i) run(i, tell);
-  }
+    start.fit = fits.Fit(i, held_out->head, held_out->head_data, inspect, tell);
+  });
   const auto best = std::min_element(starts.begin(), starts.end(), [](const Start& a, const Start& b) {
     return std::isfinite(a.cost) && (!std::isfinite(b.cost) || a.cost < b.cost);
   });

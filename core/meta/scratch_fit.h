@@ -13,6 +13,7 @@ struct FromScratchOptions {
   int32_t steps = 60;
   /// Holds the recording's tail out, to see where on the way to the minimum it is predicted best, and from which start.
   bool stop_early = false;
+  base::Executor* executor = nullptr;  ///< runs the starts; nullptr: one after the other
 };
 
 /// Fits a system of which nothing is known: the best of several starts, each a linear model of the recording (LinearStart)
@@ -23,11 +24,11 @@ struct FromScratchOptions {
 /// fifth is held out: what predicts it best on the way of all starts is the result, unless the end of that way is nearly as
 /// good; then the fit goes on to the minimum of the whole recording.
 ///
-/// @param executor  runs the restarts; nullptr: one after the other.
+/// @param on_step  called with (step, Φ) after every step of the fits, by one thread at a time; false stops, with the best
+///                 so far.
 /// Errors: FailedPrecondition if the recording is too short; OutOfRange if no start gives a finite cost.
 absl::StatusOr<SystemFit> FitFromScratch(const FitPlan& plan, const nssm::Model& model, const nssm::LossSpec& loss,
                                          const data::Trajectory& normalised, const FromScratchOptions& options,
-                                         const std::function<bool(int, double)>& on_step,
-                                         base::Executor* executor = nullptr);
+                                         const std::function<bool(int, double)>& on_step);
 
 }  // namespace metaekf::meta

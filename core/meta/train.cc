@@ -96,6 +96,7 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(const Bundle& bundle, con
 void KeepRates(const std::map<std::string, double>& rates, TrainingSpec* spec) {
   if (rates.empty()) return;
   spec->inner_loop.tensor_rates = rates;
+  spec->inner_loop.curvature_rates = spec->adaptation.curvature_rates = false;
   if (spec->adaptation.learned_rates && spec->adaptation.optimiser == spec->inner_loop.optimiser) {
     spec->adaptation.tensor_rates = rates;
   }

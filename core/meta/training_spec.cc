@@ -44,11 +44,12 @@ InnerLoopSpec ReadInnerLoop(JsonFields* parent, const std::string& name, InnerLo
   spec.optimiser = fields.Choice("optimiser", spec.optimiser, kOptimisers);
   if (spec.optimiser != default_optimiser) {
     // The rates of one optimiser are nothing to another.
-    spec.learned_rates = false;
+    spec.learned_rates = spec.curvature_rates = false;
     spec.tensor_rates.clear();
   }
   spec.proximal = fields.Number("proximal", spec.proximal, 0, 1e12);
   spec.learned_rates = fields.Bool("learned_rates", spec.learned_rates);
+  spec.curvature_rates = fields.Bool("curvature_rates", spec.curvature_rates);
   if (fields.Has("tensor_rates")) spec.tensor_rates = fields.NumbersByName("tensor_rates", kSmallestRate, kLargestRate);
   parent->Include(fields.Finish());
   return spec;
@@ -61,6 +62,7 @@ json InnerLoopJson(const InnerLoopSpec& spec) {
           {"optimiser", NameOf(kOptimisers, spec.optimiser)},
           {"proximal", spec.proximal},
           {"learned_rates", spec.learned_rates},
+          {"curvature_rates", spec.curvature_rates},
           {"tensor_rates", spec.tensor_rates}};
 }
 
@@ -116,6 +118,9 @@ void CheckInnerLoop(const TrainingSpec& spec, JsonFields* fields) {
   if (inner.learned_rates && inner.learning_rate < kSmallestRate) {
     fields->Fail("inner_loop.learning_rate", "learned rates begin with it, so it must be positive");
   }
+  if (inner.curvature_rates && (!inner.learned_rates || inner.optimiser != Optimiser::kGradientDescent)) {
+    fields->Fail("inner_loop.curvature_rates", "is where learned_rates of GRADIENT_DESCENT begin, and nothing without them");
+  }
   if (spec.algorithm == Algorithm::kReptile && inner.steps == 0) {
     fields->Fail("inner_loop.steps", "REPTILE learns from the inner steps and needs one at least");
   }
@@ -158,6 +163,7 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
   };
   spec.context_samples = positive("context_samples", spec.context_samples);
   spec.target_samples = positive("target_samples", spec.target_samples);
+  spec.contexts_at_start = fields.Bool("contexts_at_start", spec.contexts_at_start);
   spec.task_batch = positive("task_batch", spec.task_batch);
   spec.iterations = positive("iterations", spec.iterations);
   spec.restarts = positive("restarts", spec.restarts);
@@ -194,6 +200,7 @@ json ToJson(const TrainingSpec& spec) {
           {"implicit_maml", {{"cg_steps", spec.implicit_maml.cg_steps}, {"cg_tolerance", spec.implicit_maml.cg_tolerance}}},
           {"context_samples", spec.context_samples},
           {"target_samples", spec.target_samples},
+          {"contexts_at_start", spec.contexts_at_start},
           {"task_batch", spec.task_batch},
           {"iterations", spec.iterations},
           {"restarts", spec.restarts},

@@ -21,6 +21,7 @@ struct InnerLoopSpec {
   Optimiser optimiser = Optimiser::kGradientDescent;
   double proximal = 1;  ///< λ of kImplicitMaml, and of kLevenbergMarquardt where no prior has been learned
   bool learned_rates = false;
+  bool curvature_rates = false;
   std::map<std::string, double> tensor_rates;  ///< by the tensor's name; the others' is learning_rate
 };
 
@@ -54,6 +55,7 @@ struct TrainingSpec {
   ImplicitMamlSpec implicit_maml;
   int32_t context_samples = 100;
   int32_t target_samples = 100;
+  bool contexts_at_start = false;
   int32_t task_batch = 8;
   int32_t iterations = 1000;
   int32_t restarts = 1;

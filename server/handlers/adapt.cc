@@ -1,8 +1,12 @@
+#include <algorithm>
+#include <memory>
 #include <optional>
+#include <thread>
 #include <utility>
 
 #include "absl/strings/str_cat.h"
 #include "absl/time/clock.h"
+#include "core/base/executor.h"
 #include "core/base/status.h"
 #include "core/nssm/model_file.h"
 #include "server/convert/adaptations.h"
@@ -19,6 +23,7 @@ using Request = v1::AdaptRequest;
 using Response = v1::AdaptResponse;
 using Sink = ResponseSink<Response>;
 
+constexpr unsigned kMaxThreads = 3;  // starts that compete
 constexpr absl::Duration kProgressPeriod = absl::Milliseconds(50);
 
 class AdaptCall final : public StreamHandler<Request, Response> {
@@ -51,8 +56,11 @@ class AdaptCall final : public StreamHandler<Request, Response> {
       return absl::OkStatus();
     }
     const absl::Time start = absl::Now();
+    const auto executor = base::MakeThreadExecutor(std::clamp(std::thread::hardware_concurrency(), 1U, kMaxThreads));
+    meta::AdaptationOptions options = options_;
+    options.executor = executor.get();
     METAEKF_ASSIGN_OR_RETURN(meta::AdaptationResult result,
-                             meta::Adapt(model_->bundle, *context, options_,
+                             meta::Adapt(model_->bundle, *context, options,
                                          [&](const meta::AdaptationStep& step) {
                                            if (!step.trial) SendProgress(step, sink);
                                            return !sink.cancelled();

@@ -267,5 +267,22 @@ TEST_F(KnownAnswersTest, AnilWithTheFullMaskIsMamlBitForBit) {
   }
 }
 
+TEST_F(KnownAnswersTest, CurvaturesAreTheLargestEigenvaluesOfTheBlocks) {
+  const MetaGradient<double> meta(model_, spec_, shape_, shape_, mask_);
+  MetaGradient<double>::Scratch scratch(meta);
+  const std::vector<double> curvatures = meta.Curvatures(parameters_.data(), context_, &scratch);
+  ASSERT_EQ(curvatures.size(), 2u);
+  std::vector<std::string> names;
+  for (size_t i = 0; i < mask_.size(); ++i) {
+    if (mask_[i]) names.push_back(model_.layout().tensors()[i].name);
+  }
+  const double of_weight = Eigen::SelfAdjointEigenSolver<MatrixXd>(of_context_.A.topLeftCorner(3, 3)).eigenvalues()[2];
+  for (size_t l = 0; l < 2; ++l) {
+    const double expected = names[l] == "output_decoder.0.weight" ? of_weight : of_context_.A(3, 3);
+    EXPECT_LE(curvatures[l], expected * (1 + 1e-12)) << names[l];
+    EXPECT_GT(curvatures[l], 0.99 * expected) << names[l];
+  }
+}
+
 }  // namespace
 }  // namespace metaekf::meta

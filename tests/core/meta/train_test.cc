@@ -245,6 +245,52 @@ TEST(TrainTest, LearnedRatesGoIntoTheModelFileAndAreAdaptedWith) {
   EXPECT_NE(std::string(AdaptedParameters(bundle, system, unknown).status().message()).find("\"engine\""), std::string::npos);
 }
 
+// Descent on a loss of another scale takes rates of the inverse scale: those that begin at the curvature do.
+TEST(TrainTest, CurvatureRatesBeginAtTheScaleOfTheLoss) {
+  const auto rates = [](double weight) {
+    TrainingSpec spec = SmallSpec();
+    spec.inner_loop.learned_rates = spec.inner_loop.curvature_rates = true;
+    spec.inner_loop.learning_rate = 1;
+    spec.adaptation = spec.inner_loop;
+    spec.loss.state_weight = spec.loss.output_weight = weight;
+    spec.loss.reconstruction_weight = 0;
+    spec.warmup_iterations = 0;
+    spec.iterations = 1;
+    const nssm::Bundle bundle = *Train(spec, Fleet(10, 80, 1), nullptr, base::MakeSerialExecutor().get(), nullptr);
+    // What is kept are the rates themselves, not what they began as.
+    EXPECT_FALSE(ReadTrainingSpec(bundle.training)->inner_loop.curvature_rates);
+    return DefaultAdaptation(bundle)->inner_loop.tensor_rates;
+  };
+  const std::map<std::string, double> of_one = rates(1), of_hundred = rates(100);
+  ASSERT_EQ(of_one.size(), 4u);
+  for (const auto& [name, rate] : of_one) {
+    EXPECT_NEAR(of_hundred.at(name) * 100 / rate, 1, 0.05) << name;  // one outer step of a hundredth on their logarithms
+  }
+}
+
+// Only the first samples of a recording tell systems apart, so contexts from anywhere else teach nothing.
+TEST(TrainTest, ContextsAtTheStartAreTheFirstSamples) {
+  Dataset fleet = Fleet(30, 120, 1);
+  for (Trajectory& t : fleet.trajectories) {
+    const int64_t silent = t.length() - 40;
+    t.inputs.rightCols(silent).setZero();
+    t.states.rightCols(silent).setZero();
+    t.outputs.rightCols(silent).setZero();
+  }
+  const auto best_validation_loss = [&](bool at_start) {
+    TrainingSpec spec = SmallSpec();
+    spec.contexts_at_start = at_start;
+    spec.iterations = 300;
+    double best = 0;
+    EXPECT_TRUE(Train(spec, fleet, nullptr, base::MakeThreadExecutor(2).get(), [&](const TrainingProgress& p) {
+                  best = p.state.best_validation_loss;
+                  return true;
+                }).ok());
+    return best;
+  };
+  EXPECT_LT(best_validation_loss(true), 0.7 * best_validation_loss(false));
+}
+
 TEST(TrainTest, AModelOfImplicitMamlIsPulledToItsStartAtAdaptationToo) {
   TrainingSpec spec = SmallSpec();
   spec.algorithm = Algorithm::kImplicitMaml;

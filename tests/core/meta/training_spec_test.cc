@@ -83,6 +83,9 @@ TEST(TrainingSpecTest, WhatAnAlgorithmCannotUseIsRefusedByName) {
   expect_refused({{"algorithm", "IMPLICIT_MAML"}, {"inner_loop", least_squares}, {"loss", {{"reconstruction_weight", 0.5}}}},
                  "loss.reconstruction_weight");
   expect_refused({{"inner_loop", {{"learned_rates", true}, {"learning_rate", 0}}}}, "inner_loop.learning_rate");
+  expect_refused({{"inner_loop", {{"curvature_rates", true}}}}, "inner_loop.curvature_rates");
+  expect_refused({{"inner_loop", {{"curvature_rates", true}, {"learned_rates", true}, {"optimiser", "ADAM"}}}},
+                 "inner_loop.curvature_rates");
   expect_refused({{"inner_loop", {{"tensor_rates", {{"a", -1}}}}}}, "inner_loop.tensor_rates.a");
   expect_refused({{"inner_loop", {{"tensor_rates", 3}}}}, "inner_loop.tensor_rates");
   expect_refused({{"implicit_maml", {{"cg_tolerance", 2}}}}, "implicit_maml.cg_tolerance");

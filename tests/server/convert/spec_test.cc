@@ -70,7 +70,7 @@ v1::TrainingSpec FullSpec() {
   model.mutable_output_constraint()->mutable_curl_free()->set_position_states(0, 0);
   model.mutable_output_constraint()->mutable_curl_free()->set_position_states(1, 1);
   model.set_output_size(2);  // as many as positions
-  spec.mutable_inner_loop()->set_optimiser(v1::InnerLoopSpec::ADAM);  // the last is for adaptation
+  spec.mutable_inner_loop()->set_optimiser(v1::InnerLoopSpec::GRADIENT_DESCENT);  // whose curvature_rates
   spec.set_algorithm(v1::TrainingSpec::FIRST_ORDER_MAML);             // the last learns no rates
   model.set_start(v1::ModelSpec::ENCODED);  // FITTED is Case I's
   spec.set_screening_iterations(spec.iterations());  // at most
