@@ -85,7 +85,10 @@ class ThreadExecutor : public Executor {
 
 }  // namespace
 
-std::unique_ptr<Executor> MakeSerialExecutor() { return std::make_unique<SerialExecutor>(); }
+Executor* CallingThread() {
+  static SerialExecutor executor;
+  return &executor;
+}
 
 std::unique_ptr<Executor> MakeThreadExecutor(size_t threads) {
   return std::make_unique<ThreadExecutor>(threads);

@@ -21,8 +21,8 @@ class Executor {
   virtual size_t concurrency() const = 0;
 };
 
-/// Runs everything in the calling thread.
-std::unique_ptr<Executor> MakeSerialExecutor();
+/// Runs everything in the calling thread. One for all: it has no state.
+Executor* CallingThread();
 
 /// Runs on `threads` threads, the caller's among them; threads must be positive.
 std::unique_ptr<Executor> MakeThreadExecutor(size_t threads);

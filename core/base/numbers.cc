@@ -43,4 +43,12 @@ std::optional<double> ParseDouble(std::string_view text) {
   return value;
 }
 
+double Quantile(const std::vector<double>& sorted, double share) {
+  const double place = share * static_cast<double>(sorted.size() - 1);
+  const size_t below = static_cast<size_t>(place);
+  const double weight = place - static_cast<double>(below);
+  if (weight == 0 || !std::isfinite(sorted[below])) return sorted[below];
+  return sorted[below] + weight * (sorted[below + 1] - sorted[below]);
+}
+
 }  // namespace metaekf::base

@@ -31,26 +31,27 @@ struct Scale {
 
 Scale ScaleOf(const Options& options) {
   Scale scale = options.budget == Budget::kFull    ? Scale{20, 200, {}}
-                : options.budget == Budget::kQuick ? Scale{2, 200, {}}
+                : options.budget == Budget::kQuick ? Scale{1, 200, {}}
                                                    : Scale{1, 4, 400};
   if (options.seeds) scale.runs = *options.seeds;
   return scale;
 }
 
-/// The paper's shape, an encoder of 5 layers, with narrower layers and smooth activations.
+/// The paper's shape, an encoder of 5 layers, with narrower layers and smooth activations. Inner rates begin at the inverse
+/// curvature of each tensor and are learned, so that no mask is at a disadvantage by its rate.
 constexpr char kCommon[] = R"json({
   "model": {
     "case": "STATE_INPUT_OUTPUT", "latent_size": 8, "precision": "FLOAT64",
     "encoder": {"hidden_widths": [16, 16, 16, 16], "activation": "TANH"},
     "transition": {"form": "AUTONOMOUS", "bypass": "SKIP",
-                   "block": {"hidden_widths": [16], "activation": "TANH", "output_scale": 0.1}}
+                   "increment_scale": 0.02, "block": {"hidden_widths": [16], "activation": "TANH"}}
   },
-  "loss": {"horizon": 10, "stride": 20, "rollout": "STATE"},
-  "inner_loop": {"steps": 5, "learning_rate": 2e-3},
-  "adaptation": {"steps": 40},
-  "context_samples": 200, "target_samples": 200, "task_batch": 4, "clip_norm": 1, "validation_period": 100,
-  "iterations": 1800, "warmup_iterations": 1500, "warmup_horizon": 10,
-  "warmup_lr": 0.01, "outer_lr": 0.001, "final_outer_lr": 1e-4
+  "loss": {"horizon": 20, "stride": 40, "rollout": "STATE"},
+  "inner_loop": {"steps": 5, "learning_rate": 1, "learned_rates": true, "curvature_rates": true},
+  "adaptation": {"steps": 10},
+  "context_samples": 200, "target_samples": 200, "contexts_at_start": true, "task_batch": 4, "clip_norm": 0.1,
+  "validation_period": 100, "iterations": 4000, "warmup_iterations": 3000, "warmup_horizon": 10,
+  "warmup_lr": 0.01, "outer_lr": 0.001, "final_outer_lr": 2e-5
 })json";
 
 /// "ANIL_AdaptEnc12_Fix345S": the layers of 1 … k, or of k + 1 … 5 and S, adapt; decoders always do.
@@ -73,7 +74,7 @@ Learner AnilLearner(int k, bool first_layers, const json& common) {
 
 std::vector<Learner> Learners(Budget budget) {
   json common = json::parse(kCommon);
-  if (budget == Budget::kTiny) common.merge_patch({{"iterations", 4}, {"warmup_iterations", 2}});
+  if (budget == Budget::kTiny) common.merge_patch({{"iterations", 4}, {"warmup_iterations", 2}, {"loss", {{"horizon", 2}, {"stride", 80}}}});
   std::vector<Learner> learners = {{"MAML", TrainingData::kFleet, common}, {"FO-MAML", TrainingData::kFleet, common}};
   learners[0].specification["algorithm"] = "MAML";
   learners[1].specification["algorithm"] = "FIRST_ORDER_MAML";
@@ -181,12 +182,12 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
   const size_t jobs = learners.size() * runs;
   const absl::Status studied = RunJobs(jobs, executor, "models trained", on_progress, [&](size_t job) -> absl::Status {
     const size_t run = job / learners.size(), i = job % learners.size();
-    const std::unique_ptr<base::Executor> serial = base::MakeSerialExecutor();
+    base::Executor* const serial = base::CallingThread();
     METAEKF_ASSIGN_OR_RETURN(const sim::Fleet fleet,
                              sim::Simulate({.system = "van-der-pol", .systems = scale.sources, .seed = kFirstSeed + run,
                                             .steps = scale.source_samples}, *serial));
     const double begin = ThreadSeconds();
-    const absl::StatusOr<nssm::Bundle> bundle = TrainLearner(learners[i], fleet.dataset, {}, kFirstSeed + run, serial.get());
+    const absl::StatusOr<nssm::Bundle> bundle = TrainLearner(learners[i], fleet.dataset, {}, kFirstSeed + run, serial);
     seconds[i][run] = ThreadSeconds() - begin;
     if (absl::IsOutOfRange(bundle.status())) return absl::OkStatus();  // diverged: this run has failed, no more
     METAEKF_RETURN_IF_ERROR(bundle.status());

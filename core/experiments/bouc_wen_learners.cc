@@ -1,9 +1,11 @@
 #include "core/experiments/bouc_wen_learners.h"
 
+#include <algorithm>
 #include <chrono>
 
 #include "absl/strings/str_cat.h"
 #include "core/base/status.h"
+#include "core/experiments/jobs.h"
 #include "core/meta/adapt.h"
 
 namespace metaekf::experiments {
@@ -11,7 +13,9 @@ namespace {
 
 using nlohmann::json;
 
-/// The recipe of deploy/specs/bouc-wen.textproto: fits in free run over whole recordings, starts fitted, no encoder.
+constexpr int32_t kScratchSteps = 2000;  // of a gradient-based fit at most
+
+/// The recipe of deploy/specs/bouc-wen.textproto, a round less: fits in free run over whole recordings, starts fitted, no encoder.
 constexpr char kGaussianPrior[] = R"json({
   "algorithm": "GAUSSIAN_PRIOR",
   "model": {
@@ -20,22 +24,23 @@ constexpr char kGaussianPrior[] = R"json({
                    "block": {"hidden_widths": [16], "activation": "TANH", "output_scale": 0.1}}
   },
   "loss": {"whole_set_horizon": true},
-  "gaussian_prior": {"initial_std": 0.1, "restarts": 4, "first_steps": 60, "round_steps": 15, "rounds": 3},
+  "gaussian_prior": {"initial_std": 0.1, "restarts": 4, "first_steps": 60, "round_steps": 15, "rounds": 2},
   "context_samples": 500, "target_samples": 2000, "validation_share": 0.1
 })json";
 
-/// The gradient-based learners: the same transition behind a linear encoder of 20 samples.
+/// The gradient-based learners, after deploy/specs/bouc-wen-maml.textproto in half its iterations: the same transition behind a
+/// linear encoder of 40 samples.
 constexpr char kGradientBased[] = R"json({
   "model": {
-    "case": "INPUT_OUTPUT", "latent_size": 6, "window": 20, "precision": "FLOAT64",
+    "case": "INPUT_OUTPUT", "latent_size": 6, "window": 40, "precision": "FLOAT64",
     "transition": {"form": "JOINT", "bypass": "LINEAR", "input_time": "NEXT",
                    "block": {"hidden_widths": [16], "activation": "TANH", "output_scale": 0.1}}
   },
-  "loss": {"horizon": 40, "stride": 20},
+  "loss": {"horizon": 20, "stride": 10},
   "inner_loop": {"steps": 5, "learning_rate": 1e-4},
   "adaptation": {"steps": 300, "learning_rate": 1e-3, "optimiser": "ADAM"},
-  "context_samples": 500, "target_samples": 500, "task_batch": 4, "clip_norm": 1, "validation_period": 50,
-  "iterations": 2400, "warmup_iterations": 2000, "warmup_horizon": 20,
+  "context_samples": 512, "target_samples": 512, "task_batch": 8, "clip_norm": 1, "validation_period": 50,
+  "iterations": 4600, "warmup_iterations": 4000, "warmup_horizon": 20,
   "warmup_lr": 0.01, "outer_lr": 0.001, "final_outer_lr": 1e-4
 })json";
 
@@ -115,26 +120,33 @@ absl::StatusOr<SystemModel> FitFromScratch(const nssm::Bundle& bundle, const dat
   METAEKF_ASSIGN_OR_RETURN(meta::AdaptationOptions options,
                            meta::DefaultAdaptation(bundle, meta::AdaptationMethod::kFromScratch));
   options.seed = seed;
+  options.inner_loop.steps = std::min(options.inner_loop.steps, kScratchSteps);
   nssm::Bundle fitted = bundle;
-  METAEKF_ASSIGN_OR_RETURN(fitted.parameters, meta::AdaptedParameters(bundle, context, options));
+  if (bundle.model.spec().fits_start()) {  // holds a tail out by itself
+    METAEKF_ASSIGN_OR_RETURN(fitted.parameters, meta::AdaptedParameters(bundle, context, options));
+  } else {
+    METAEKF_ASSIGN_OR_RETURN(meta::AdaptationResult result, meta::Adapt(bundle, context, options, nullptr));
+    fitted.parameters = std::move(result.parameters);
+  }
   return ModelOf(fitted);
 }
 
-absl::StatusOr<std::vector<nssm::Bundle>> TrainAll(const std::vector<Learner>& learners, const data::Dataset& fleet,
-                                                   const data::Trajectory& context, uint64_t seed, base::Executor* executor, const OnProgress& on_progress,
-                                                   std::vector<double>* seconds) {
+absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learners, const data::Dataset& fleet,
+                                               const data::Trajectory& context, uint64_t seed, base::Executor* executor,
+                                               const OnProgress& on_progress) {
   using Clock = std::chrono::steady_clock;
-  std::vector<nssm::Bundle> bundles;
+  std::vector<Training> trainings;
   for (const Learner& learner : learners) {
-    if (on_progress && !on_progress(bundles.size(), learners.size(), "training " + learner.label)) {
+    if (on_progress && !on_progress(trainings.size(), learners.size(), "training " + learner.label)) {
       return absl::CancelledError("the study was cancelled");
     }
+    const PeakMemory memory;
     const Clock::time_point begin = Clock::now();
     METAEKF_ASSIGN_OR_RETURN(nssm::Bundle bundle, TrainLearner(learner, fleet, context, seed, executor));
-    bundles.push_back(std::move(bundle));
-    seconds->push_back(std::chrono::duration<double>(Clock::now() - begin).count());
+    const double seconds = std::chrono::duration<double>(Clock::now() - begin).count();
+    trainings.push_back({std::move(bundle), seconds, memory.MiB()});
   }
-  return bundles;
+  return trainings;
 }
 
 }  // namespace metaekf::experiments

@@ -7,7 +7,7 @@
 
 namespace metaekf::experiments {
 
-inline constexpr char kFromScratchLabel[] = "SSM from scratch";
+inline constexpr char kFromScratchLabel[] = "SSM from scratch", kByGradientsLabel[] = "SSM from scratch, gradient steps";
 
 /// Small networks in double precision: what a fleet of Bouc–Wen oscillators can be learned with here. Those that this build
 /// does not know are left out.
@@ -16,15 +16,22 @@ std::vector<Learner> BoucWenLearners(Budget budget);
 /// MAML with the network that the paper prints, in a fraction of its training.
 Learner PrintedMaml(Budget budget);
 
-/// The most probable parameters of a model that knows nothing but the context (meta::FitFromScratch). Architecture and
-/// normaliser are those of `bundle`. Errors: those of meta::AdaptedParameters.
+/// A model that knows nothing but the context, fitted as `metaekf adapt --method from-scratch` does it: exactly (label
+/// kFromScratchLabel) where the start is fitted, else by gradient steps (kByGradientsLabel), both stopped early. Architecture
+/// and normaliser are those of `bundle`. Errors: those of meta::Adapt.
 absl::StatusOr<SystemModel> FitFromScratch(const nssm::Bundle& bundle, const data::Trajectory& context, uint64_t seed);
+
+/// What a training has brought, and what it took.
+struct Training {
+  nssm::Bundle bundle;
+  double seconds = 0;     ///< on the wall
+  double memory_mib = 0;  ///< at its peak
+};
 
 /// Trains every learner on the fleet, one after the other with all threads.
 /// @param context  of the target, for learners that train on it too.
-/// @param seconds  on the wall, of each.
-absl::StatusOr<std::vector<nssm::Bundle>> TrainAll(const std::vector<Learner>& learners, const data::Dataset& fleet,
-                                                   const data::Trajectory& context, uint64_t seed, base::Executor* executor, const OnProgress& on_progress,
-                                                   std::vector<double>* seconds);
+absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learners, const data::Dataset& fleet,
+                                               const data::Trajectory& context, uint64_t seed, base::Executor* executor,
+                                               const OnProgress& on_progress);
 
 }  // namespace metaekf::experiments

@@ -1,8 +1,7 @@
-#include <sys/resource.h>
-
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <optional>
 
 #include "core/base/numbers.h"
 #include "core/base/status.h"
@@ -12,6 +11,7 @@
 #include "core/experiments/classical.h"
 #include "core/experiments/jobs.h"
 #include "core/experiments/studies.h"
+#include "core/plot/box_plot.h"
 #include "core/plot/svg.h"
 
 namespace metaekf::experiments {
@@ -25,6 +25,8 @@ constexpr uint64_t kFirstSeed = 1;        // of runs: fleet and training
 constexpr uint64_t kSignalSeed = 555001;  // + run: of the simulated estimation signal
 constexpr uint64_t kTestSeed = 666001;    // + run: of the tests
 constexpr int64_t kScoredFrom = 64;       // of a test: beyond the warm-up of every model
+constexpr int64_t kPeriodSamples = 750;   // of 120 sin 2πt
+constexpr int kFullSteps = 500;           // of Adam at adaptation: one target bears more than the hundred of a few-shot curve
 constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
 
 struct Scale {
@@ -56,6 +58,10 @@ std::vector<ClassicalModel> ClassicalModels() { return {Arx(5), OutputError(5), 
 /// Those of the fleet, and one for all systems, the target among them.
 std::vector<Learner> Learners(Budget budget) {
   std::vector<Learner> learners = BoucWenLearners(budget);
+  for (Learner& learner : learners) {
+    json& adaptation = learner.specification["adaptation"];
+    if (budget == Budget::kFull && adaptation["optimiser"] == "ADAM") adaptation["steps"] = kFullSteps;
+  }
   const auto transferred =
       std::find_if(learners.begin(), learners.end(), [](const Learner& one) { return one.label == "Xfer"; });
   Learner universal{"Univ", TrainingData::kFleetAndContext, transferred->specification};
@@ -89,7 +95,7 @@ json Protocol(const Options& options) {
 /// How good one model is after one length of context; nothing measured where it needs more.
 struct Outcome {
   bool measured = false;
-  double one_step_rmse = kNan, one_step_fit = kNan, free_rmse = kNan, free_fit = kNan, seconds = 0;
+  double one_step_rmse = kNan, one_step_fit = kNan, free_rmse = kNan, free_fit = kNan, seconds = 0, memory_mib = kNan;
   MatrixXd free;  // of the first test
 };
 
@@ -114,7 +120,7 @@ absl::Status Judge(const SystemModel& model, const std::vector<Trajectory>& test
 /// Models, each with outcomes by run and length.
 struct Results {
   std::vector<std::string> labels;
-  std::vector<std::vector<double>> training_s;
+  std::vector<std::vector<double>> training_s, training_mib;
   std::vector<std::vector<std::vector<Outcome>>> outcomes;
 
   size_t IndexOf(const std::string& label) {
@@ -122,6 +128,7 @@ struct Results {
     if (place != labels.end()) return static_cast<size_t>(place - labels.begin());
     labels.push_back(label);
     training_s.emplace_back();
+    training_mib.emplace_back();
     outcomes.emplace_back();
     return labels.size() - 1;
   }
@@ -148,21 +155,28 @@ absl::StatusOr<Target> MakeTarget(const Options& options, const Scale& scale, ui
 
 using Fit = std::function<absl::StatusOr<SystemModel>(const Trajectory& context)>;
 
-/// Fits and judges models at every length, side by side.
+/// Fits and judges models at every length, side by side; of the greatest one after the other, for their memory to be told
+/// apart.
 absl::Status JudgeAll(const std::vector<std::pair<size_t, Fit>>& models, const Scale& scale, const Target& target,
                       base::Executor* executor, const OnProgress& on_progress, Results* results) {
   const size_t lengths = scale.lengths.size();
   std::vector<Outcome> outcomes(models.size() * lengths);
-  const auto judge = [&](size_t job) -> absl::Status {
-    METAEKF_ASSIGN_OR_RETURN(const Trajectory context, data::FirstSamples(target.signal, scale.lengths[job % lengths]));
-    Outcome& outcome = outcomes[job];
+  const auto judge = [&](size_t model_index, size_t length, bool alone) -> absl::Status {
+    METAEKF_ASSIGN_OR_RETURN(const Trajectory context, data::FirstSamples(target.signal, scale.lengths[length]));
+    Outcome& outcome = outcomes[model_index * lengths + length];
+    std::optional<PeakMemory> memory;
+    if (alone) memory.emplace();
     const double begin = ThreadSeconds();
-    const absl::StatusOr<SystemModel> model = models[job / lengths].second(context);
+    const absl::StatusOr<SystemModel> model = models[model_index].second(context);
     outcome.seconds = ThreadSeconds() - begin;
+    if (memory) outcome.memory_mib = memory->MiB();
     outcome.measured = !absl::IsFailedPrecondition(model.status());
     return model.ok() ? Judge(*model, target.tests, &outcome) : absl::OkStatus();
   };
-  METAEKF_RETURN_IF_ERROR(RunJobs(outcomes.size(), executor, "models adapted and judged", on_progress, judge));
+  METAEKF_RETURN_IF_ERROR(RunJobs(models.size() * (lengths - 1), executor, "models adapted and judged", on_progress,
+                                  [&](size_t job) { return judge(job / (lengths - 1), job % (lengths - 1), false); }));
+  METAEKF_RETURN_IF_ERROR(RunJobs(models.size(), base::CallingThread(), "models adapted to the longest context", on_progress,
+                                  [&](size_t job) { return judge(job, lengths - 1, true); }));
   for (size_t i = 0; i < models.size(); ++i) {
     const auto first = outcomes.begin() + static_cast<std::ptrdiff_t>(i * lengths);
     results->outcomes[models[i].first].emplace_back(first, first + static_cast<std::ptrdiff_t>(lengths));
@@ -178,18 +192,20 @@ absl::Status RunOnce(const Options& options, const Scale& scale, uint64_t run, b
   for (const FleetKind& kind : kFleets) {
     METAEKF_ASSIGN_OR_RETURN(const sim::Fleet fleet, BoucWenFleet(scale.systems, scale.fleet_samples, kind.excitation,
                                                                   kFirstSeed + run, executor));
-    std::vector<double> seconds;
-    METAEKF_ASSIGN_OR_RETURN(const std::vector<nssm::Bundle> bundles,
-                             TrainAll(learners, fleet.dataset, target.signal, kFirstSeed + run, executor, on_progress, &seconds));
+    METAEKF_ASSIGN_OR_RETURN(const std::vector<Training> trainings,
+                             TrainAll(learners, fleet.dataset, target.signal, kFirstSeed + run, executor, on_progress));
     for (size_t i = 0; i < learners.size(); ++i) {
       const size_t index = results->IndexOf(absl::StrCat(learners[i].label, ", ", kind.label));
-      results->training_s[index].push_back(seconds[i]);
-      models.emplace_back(index, [bundle = bundles[i]](const Trajectory& context) { return AdaptToContext(bundle, context); });
+      results->training_s[index].push_back(trainings[i].seconds);
+      results->training_mib[index].push_back(trainings[i].memory_mib);
+      models.emplace_back(index, [bundle = trainings[i].bundle](const Trajectory& context) { return AdaptToContext(bundle, context); });
     }
     if (kind.excitation != BoucWenExcitation::kMultisine) continue;
-    models.emplace_back(results->IndexOf(kFromScratchLabel), [bundle = bundles[0], run](const Trajectory& context) {
-      return FitFromScratch(bundle, context, kFirstSeed + run);
-    });
+    for (const auto& [label, model] : {std::pair{kFromScratchLabel, 0}, {kByGradientsLabel, 1}}) {
+      models.emplace_back(results->IndexOf(label), [bundle = trainings[static_cast<size_t>(model)].bundle, run](const Trajectory& context) {
+        return FitFromScratch(bundle, context, kFirstSeed + run);
+      });
+    }
   }
   for (const ClassicalModel& model : ClassicalModels()) models.emplace_back(results->IndexOf(model.label), model.fit);
   return JudgeAll(models, scale, target, executor, on_progress, results);
@@ -214,11 +230,18 @@ Table TableOf(const Results& results, const Scale& scale, const std::string& nam
 Table Times(const Results& results, const Scale& scale) {
   Table table = TableOf(results, scale, "times", "Time: adaptation of a processor by samples of context, training on the wall",
                         "s", false, &Outcome::seconds);
+  table.columns.push_back({"memory of the last", "MiB"});
   table.columns.push_back({"training", "s"});
-  for (size_t i = 0; i < table.rows.size(); ++i) table.rows[i].cells.push_back(results.training_s[i]);
-  rusage usage{};
-  getrusage(RUSAGE_SELF, &usage);
-  table.notes = {absl::StrCat("Peak memory of the whole study: ", usage.ru_maxrss / 1024, " MiB.")};
+  table.columns.push_back({"memory of the training", "MiB"});
+  for (size_t i = 0; i < table.rows.size(); ++i) {
+    std::vector<double>& memory = table.rows[i].cells.emplace_back();
+    for (const auto& run : results.outcomes[i]) {
+      if (run.back().measured) memory.push_back(run.back().memory_mib);
+    }
+    table.rows[i].cells.push_back(results.training_s[i]);
+    table.rows[i].cells.push_back(results.training_mib[i]);
+  }
+  table.notes = {"Memory is the peak beyond what the process held before, its own code and data aside."};
   return table;
 }
 
@@ -257,10 +280,29 @@ absl::StatusOr<Picture> DrawPrediction(const std::string& label, const Outcome& 
   return Picture{"bouc-wen-performance", std::move(svg)};
 }
 
-/// Displacement against force over the last second of every system of the fleet as printed.
+/// Errors in free run over the first test, after the longest context, of the best model and of some others.
+absl::StatusOr<Picture> DrawErrors(const Results& results, size_t best, const Trajectory& test) {
+  plot::BoxPlot picture{.title = "Errors in free run on an unseen multisine", .x_label = "error (mm)"};
+  std::vector<std::string> labels = {results.labels[best]};
+  for (const char* other : {"MAML, multisine fleet", "Xfer, multisine fleet", kFromScratchLabel, "ARX(5)"}) {
+    if (labels[0] != other) labels.emplace_back(other);
+  }
+  for (const std::string& label : labels) {
+    const auto place = std::find(results.labels.begin(), results.labels.end(), label);
+    if (place == results.labels.end()) continue;
+    const MatrixXd& free = results.outcomes[static_cast<size_t>(place - results.labels.begin())][0].back().free;
+    plot::Box box{.label = label};
+    for (Eigen::Index t = 0; t < free.cols(); ++t) box.values.push_back(1e3 * (free(0, t) - test.outputs(0, t + kScoredFrom)));
+    picture.boxes.push_back(std::move(box));
+  }
+  METAEKF_ASSIGN_OR_RETURN(std::string svg, plot::RenderSvg(picture));
+  return Picture{"error-distribution", std::move(svg)};
+}
+
+/// Displacement against force over a second, one period, of every system of the fleet as printed.
 absl::StatusOr<Picture> DrawLoops(const Scale& scale, base::Executor* executor) {
   METAEKF_ASSIGN_OR_RETURN(const sim::Fleet fleet,
-                           BoucWenFleet(scale.systems, std::min<int64_t>(scale.fleet_samples, 750), BoucWenExcitation::kSine,
+                           BoucWenFleet(scale.systems, std::min(scale.fleet_samples, kPeriodSamples + 1), BoucWenExcitation::kSine,
                                         kFirstSeed, executor));
   plot::Panel panel{.y_label = "displacement (mm)"};
   for (const Trajectory& system : fleet.dataset.trajectories) {
@@ -304,8 +346,9 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
   METAEKF_ASSIGN_OR_RETURN(const Target target, MakeTarget(options, scale, 0, executor));
   METAEKF_ASSIGN_OR_RETURN(Picture performance,
                            DrawPrediction(results.labels[best], results.outcomes[best][0].back(), target.tests[0]));
+  METAEKF_ASSIGN_OR_RETURN(Picture errors, DrawErrors(results, best, target.tests[0]));
   METAEKF_ASSIGN_OR_RETURN(Picture loops, DrawLoops(scale, executor));
-  report.pictures = {std::move(performance), std::move(loops)};
+  report.pictures = {std::move(performance), std::move(errors), std::move(loops)};
   return report;
 }
 

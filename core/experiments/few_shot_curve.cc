@@ -22,6 +22,7 @@ using nlohmann::json;
 
 constexpr uint64_t kFirstSeed = 1;        // of the fleet and of training; protocols were chosen with other seeds
 constexpr uint64_t kTargetSeed = 777001;  // of the targets
+constexpr int kManifoldRank = 10;
 constexpr int64_t kScoredFrom = 64;       // of a test: beyond the warm-up of every model
 constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
 
@@ -49,10 +50,21 @@ constexpr Published kManifold[] = {{100, 86.0}, {200, 92.7}, {300, 94.4}, {500, 
 
 std::vector<ClassicalModel> ClassicalModels() { return {Arx(5), OutputError(5), PolynomialNarx(3, 3)}; }
 
+/// Those of the fleet, and the prior of few factors: what the published rival learns.
+std::vector<Learner> Learners(Budget budget) {
+  std::vector<Learner> learners = BoucWenLearners(budget);
+  Learner manifold = learners.front();  // the Gaussian prior
+  manifold.label = absl::StrCat("Manifold of ", kManifoldRank, " factors");
+  manifold.specification["gaussian_prior"]["covariance"] = "MANIFOLD";
+  manifold.specification["gaussian_prior"]["rank"] = kManifoldRank;
+  learners.insert(learners.begin() + 1, std::move(manifold));
+  return learners;
+}
+
 json Protocol(const Options& options) {
   const Scale scale = ScaleOf(options);
   json learners = json::array(), classical = json::array();
-  for (const Learner& learner : BoucWenLearners(options.budget)) learners.push_back(ToJson(learner));
+  for (const Learner& learner : Learners(options.budget)) learners.push_back(ToJson(learner));
   for (const ClassicalModel& model : ClassicalModels()) classical.push_back(model.label);
   return {{"experiment", "few-shot-curve"},
           {"targets", scale.targets},
@@ -81,7 +93,7 @@ struct Study {
   Scale scale;
   std::vector<Learner> learners;
   std::vector<ClassicalModel> classical;
-  std::vector<nssm::Bundle> bundles;  // of the learners
+  std::vector<Training> trainings;  // of the learners
   BoucWenTargets targets;
 
   /// Learners, then the model from scratch, then the classical ones.
@@ -94,8 +106,8 @@ struct Study {
   }
 
   absl::StatusOr<SystemModel> Fit(size_t model, const Trajectory& context) const {
-    if (model < learners.size()) return AdaptToContext(bundles[model], context);
-    if (model == learners.size()) return FitFromScratch(bundles[0], context, kFirstSeed);
+    if (model < learners.size()) return AdaptToContext(trainings[model].bundle, context);
+    if (model == learners.size()) return FitFromScratch(trainings[0].bundle, context, kFirstSeed);
     return classical[model - learners.size() - 1].fit(context);
   }
 };
@@ -179,15 +191,13 @@ absl::StatusOr<Picture> Draw(const Study& study, const Table& table) {
 }
 
 absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, const OnProgress& on_progress) {
-  Study study{.scale = ScaleOf(options), .learners = BoucWenLearners(options.budget), .classical = ClassicalModels()};
+  Study study{.scale = ScaleOf(options), .learners = Learners(options.budget), .classical = ClassicalModels()};
   METAEKF_ASSIGN_OR_RETURN(const sim::Fleet fleet,
                            BoucWenFleet(study.scale.systems, study.scale.fleet_samples, BoucWenExcitation::kMultisine,
                                         kFirstSeed, executor));
   METAEKF_ASSIGN_OR_RETURN(study.targets, RandomBoucWenTargets(study.scale.targets, study.scale.lengths.back(),
                                                                study.scale.test_samples, kTargetSeed, executor));
-  std::vector<double> training_s;
-  METAEKF_ASSIGN_OR_RETURN(study.bundles, TrainAll(study.learners, fleet.dataset, {}, kFirstSeed, executor,
-                                                   on_progress, &training_s));
+  METAEKF_ASSIGN_OR_RETURN(study.trainings, TrainAll(study.learners, fleet.dataset, {}, kFirstSeed, executor, on_progress));
 
   const std::vector<std::string> labels = study.Labels();
   const size_t models = labels.size(), targets = study.targets.contexts.size();
@@ -206,10 +216,12 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
   };
   METAEKF_RETURN_IF_ERROR(RunJobs(models * targets, executor, "adaptations", on_progress, judge));
   Table times{.name = "times", .title = "Time: training on the wall, adaptation and test of one target at all lengths of a processor",
-              .row_heading = "model", .columns = {{"training", "s"}, {"one target", "s"}}};
+              .row_heading = "model", .columns = {{"training", "s"}, {"memory of the training", "MiB"}, {"one target", "s"}}};
   for (size_t model = 0; model < models; ++model) {
-    times.rows.push_back({labels[model], {{}, adaptation_s[model]}});
-    if (model < training_s.size()) times.rows.back().cells[0] = {training_s[model]};
+    times.rows.push_back({labels[model], {{}, {}, adaptation_s[model]}});
+    if (model >= study.trainings.size()) continue;
+    times.rows.back().cells[0] = {study.trainings[model].seconds};
+    times.rows.back().cells[1] = {study.trainings[model].memory_mib};
   }
   Table table = ToTable(study, fits);
   METAEKF_ASSIGN_OR_RETURN(Picture picture, Draw(study, table));

@@ -1,12 +1,36 @@
 #include "core/experiments/jobs.h"
 
+#include <malloc.h>
 #include <time.h>
 
 #include <atomic>
+#include <fstream>
+#include <limits>
 #include <mutex>
 #include <vector>
 
 namespace metaekf::experiments {
+namespace {
+
+/// A line of /proc/self/status, in MiB.
+double StatusMiB(const std::string& name) {
+  std::ifstream status("/proc/self/status");
+  for (std::string word; status >> word;) {
+    double kib = 0;
+    if (word == name + ":" && status >> kib) return kib / 1024;
+  }
+  return std::numeric_limits<double>::quiet_NaN();
+}
+
+}  // namespace
+
+PeakMemory::PeakMemory() : held_before_mib_(std::numeric_limits<double>::quiet_NaN()) {
+  malloc_trim(0);
+  std::ofstream peak("/proc/self/clear_refs");
+  if (peak << "5" << std::flush) held_before_mib_ = StatusMiB("VmRSS");  // the peak begins anew
+}
+
+double PeakMemory::MiB() const { return StatusMiB("VmHWM") - held_before_mib_; }
 
 double ThreadSeconds() {
   timespec now{};

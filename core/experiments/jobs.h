@@ -11,6 +11,16 @@ namespace metaekf::experiments {
 /// Seconds of the calling thread's processor since some moment: what a piece of work costs, whatever runs beside it.
 double ThreadSeconds();
 
+/// Memory that the process comes to hold beyond what it holds when this is made: of work that nothing runs beside.
+class PeakMemory {
+ public:
+  PeakMemory();
+  double MiB() const;  ///< so far; NaN where the system does not tell
+
+ private:
+  double held_before_mib_;
+};
+
 /// Runs job(0) … job(count − 1), each in one thread and as many at a time as the executor has.
 ///
 /// @param on_progress  told after each of them, in one thread at a time. May be empty.

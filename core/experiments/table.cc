@@ -12,15 +12,6 @@ namespace {
 
 constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
 
-/// Linear between the order statistics; at an infinite one, that one.
-double Quantile(const std::vector<double>& sorted, double share) {
-  const double place = share * static_cast<double>(sorted.size() - 1);
-  const size_t below = static_cast<size_t>(place);
-  const double weight = place - static_cast<double>(below);
-  if (weight == 0 || !std::isfinite(sorted[below])) return sorted[below];
-  return sorted[below] + weight * (sorted[below + 1] - sorted[below]);
-}
-
 /// Characters, those of several bytes counted once.
 size_t Width(const std::string& text) {
   return static_cast<size_t>(std::count_if(text.begin(), text.end(),
@@ -84,9 +75,9 @@ Statistics Summarise(const std::vector<double>& runs, bool larger_is_better) {
   if (finite > 1) s.standard_deviation = std::sqrt(squares / static_cast<double>(finite - 1));
   if (sorted.empty()) return s;
   std::sort(sorted.begin(), sorted.end());
-  s.lower_quartile = Quantile(sorted, 0.25);
-  s.median = Quantile(sorted, 0.5);
-  s.upper_quartile = Quantile(sorted, 0.75);
+  s.lower_quartile = base::Quantile(sorted, 0.25);
+  s.median = base::Quantile(sorted, 0.5);
+  s.upper_quartile = base::Quantile(sorted, 0.75);
   return s;
 }
 

@@ -9,6 +9,7 @@
 #include "core/experiments/jobs.h"
 #include "core/experiments/learner.h"
 #include "core/experiments/studies.h"
+#include "core/plot/box_plot.h"
 #include "core/plot/svg.h"
 #include "core/sim/simulate.h"
 
@@ -37,7 +38,7 @@ struct Scale {
 
 Scale ScaleOf(const Options& options) {
   Scale scale = options.budget == Budget::kFull    ? Scale{20, 200, {}, 3000, false}
-                : options.budget == Budget::kQuick ? Scale{2, 200, {}, 3000, false}
+                : options.budget == Budget::kQuick ? Scale{1, 200, {}, 3000, false}
                                                    : Scale{2, 4, 400, 30, true};
   if (options.seeds) scale.runs = *options.seeds;
   return scale;
@@ -84,9 +85,11 @@ constexpr Variant kVariants[] = {
        "algorithm": "SUPERVISED", "task_batch": 1, "validation_share": 0, "iterations": 400, "warmup_iterations": 0,
        "outer_lr": 0.01, "final_outer_lr": 0.001, "adaptation": {"steps": 0}})json"},
     {"All-NoAdapt", plot::Colour::kPurple, TrainingData::kFleetAndContext, R"json({
-       "algorithm": "SUPERVISED", "adaptation": {"steps": 0}})json"},
+       "algorithm": "SUPERVISED", "iterations": 20000, "warmup_iterations": 10000, "final_outer_lr": 2e-5,
+       "adaptation": {"steps": 0}})json"},
     {"Xfer", plot::Colour::kOrange, TrainingData::kFleet, R"json({
        "algorithm": "SUPERVISED", "model": {"transition": {"block": {"hidden_widths": [24, 24]}}},
+       "iterations": 20000, "warmup_iterations": 10000, "final_outer_lr": 2e-5,
        "adaptation": {"steps": 40, "learning_rate": 3e-4, "adapted_mask": "transition.2"}})json"},
 };
 constexpr const char* kMetaLearners[] = {"MAML", "Gaussian prior"};
@@ -170,7 +173,7 @@ absl::Status Judge(const SystemModel& model, const Trajectory& recording, Trial*
 bool IsDivergence(const absl::Status& status) { return absl::IsOutOfRange(status); }
 
 absl::StatusOr<Trial> RunTrial(const Scale& scale, uint64_t seed, size_t model_index) {
-  const std::unique_ptr<base::Executor> serial = base::MakeSerialExecutor();
+  base::Executor* const serial = base::CallingThread();
   METAEKF_ASSIGN_OR_RETURN(const sim::Fleet target, sim::Simulate(TargetOf(scale, seed), *serial));
   const Trajectory& recording = target.dataset.trajectories[0];
   METAEKF_ASSIGN_OR_RETURN(const Trajectory context, data::FirstSamples(recording, kContextSamples));
@@ -184,7 +187,7 @@ absl::StatusOr<Trial> RunTrial(const Scale& scale, uint64_t seed, size_t model_i
     return trial;
   }
   METAEKF_ASSIGN_OR_RETURN(const sim::Fleet fleet, sim::Simulate(FleetOf(scale, seed), *serial));
-  const absl::StatusOr<nssm::Bundle> bundle = TrainLearner(learners[model_index], fleet.dataset, context, seed, serial.get());
+  const absl::StatusOr<nssm::Bundle> bundle = TrainLearner(learners[model_index], fleet.dataset, context, seed, serial);
   if (IsDivergence(bundle.status())) return trial;
   METAEKF_RETURN_IF_ERROR(bundle.status());
   const double trained = ThreadSeconds();
@@ -282,6 +285,17 @@ std::vector<double> RowOf(const MatrixXd& matrix, Eigen::Index row) {
   return values;
 }
 
+/// Errors in free run of all runs, the exact NARX aside.
+absl::StatusOr<Picture> DrawDistribution(const Results& results) {
+  plot::BoxPlot picture{.title = "Errors in free run, all runs", .x_label = "sum of squared errors", .logarithmic = true};
+  for (const Variant& variant : kVariants) {
+    picture.boxes.push_back({.label = variant.label,
+                             .values = results.Values(results.IndexOf(variant.label), &Trial::free_run), .colour = variant.colour});
+  }
+  METAEKF_ASSIGN_OR_RETURN(std::string svg, plot::RenderSvg(picture));
+  return Picture{"error-distribution", std::move(svg)};
+}
+
 /// States of the first run, and the growth of the error, median of all runs: of the neural models.
 absl::StatusOr<Picture> Draw(const Results& results, const std::vector<MatrixXd>& truths, double period_s) {
   std::vector<double> times;
@@ -330,14 +344,15 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
   METAEKF_RETURN_IF_ERROR(studied);
   std::vector<MatrixXd> truths;
   double period_s = 0;
-  const std::unique_ptr<base::Executor> serial = base::MakeSerialExecutor();
+  base::Executor* const serial = base::CallingThread();
   for (size_t run = 0; run < runs; ++run) {
     METAEKF_ASSIGN_OR_RETURN(const sim::Fleet target, sim::Simulate(TargetOf(scale, kFirstSeed + run), *serial));
     truths.push_back(target.dataset.trajectories[0].states.rightCols(scale.predicted_samples));
     period_s = target.dataset.trajectories[0].sample_period_s;
   }
   METAEKF_ASSIGN_OR_RETURN(Picture picture, Draw(results, truths, period_s));
-  return Report{{Errors(results, scale), Times(results)}, Findings(results), {std::move(picture)}};
+  METAEKF_ASSIGN_OR_RETURN(Picture distribution, DrawDistribution(results));
+  return Report{{Errors(results, scale), Times(results)}, Findings(results), {std::move(picture), std::move(distribution)}};
 }
 
 }  // namespace

@@ -160,13 +160,18 @@ struct Problem {
   Eigen::VectorXd from;
 };
 
-/// What the information about [ω; c₀] says of ω: the Schur complement integrates c₀ out.
-nssm::GaussianPosterior PosteriorOf(const Eigen::MatrixXd& information, Eigen::Index adapted) {
-  const Eigen::Index starts = information.rows() - adapted;
+/// What the information about [ω; c₀], or [z; c₀], says of ω or z: the Schur complement integrates c₀ out.
+absl::StatusOr<nssm::GaussianPosterior> PosteriorOf(const MapFit& fit, Eigen::Index starts) {
+  const Eigen::MatrixXd& information = fit.information;
+  const Eigen::Index adapted = information.rows() - starts;
   nssm::GaussianPosterior posterior{information.topLeftCorner(adapted, adapted)};
+  if (fit.coordinates.size() > 0) posterior.coordinates = fit.coordinates.head(adapted);
   if (starts == 0) return posterior;
+  const linalg::Cholesky factor(information.bottomRightCorner(starts, starts));
+  if (!factor.ok()) return absl::OutOfRangeError("the adaptation diverged: the start of the context is not determined");
   const auto cross = information.bottomLeftCorner(starts, adapted);
-  posterior.information -= cross.transpose() * linalg::Cholesky(information.bottomRightCorner(starts, starts)).Solve(Eigen::MatrixXd(cross));
+  const Eigen::MatrixXd determined = posterior.information - cross.transpose() * factor.Solve(Eigen::MatrixXd(cross));
+  posterior.information = determined.selfadjointView<Eigen::Lower>();  // rounding leaves it not quite symmetric
   return posterior;
 }
 
@@ -192,9 +197,8 @@ absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const Pr
                          ? FitFromScratch(plan, bundle.model, problem.loss, context, {.seed = options.seed, .steps = steps, .stop_early = true, .executor = options.executor}, tell)
                          : FitSystem(plan, prior, bundle.parameters, context, {.steps = steps, .tolerance = problem.tolerance, .from = problem.from, .executor = options.executor}, tell));
   if (stopped) return absl::CancelledError("the adaptation was cancelled");
-  FitResult result{.parameters = std::move(fit.parameters),
-                   .posterior = PosteriorOf(fit.fit.information, plan.dynamics.adapted_size()),
-                   .unknowns = fit.fit.unknowns};
+  FitResult result{.parameters = std::move(fit.parameters), .unknowns = fit.fit.unknowns};
+  METAEKF_ASSIGN_OR_RETURN(result.posterior, PosteriorOf(fit.fit, prior.start.rows()));
   nssm::RoundToPrecision(bundle.model.spec().precision, &result.parameters);
   nssm::RolloutLeastSquares::Workspace workspace(plan.dynamics, data.shape);
   const Eigen::VectorXd weights = prior.noise_variance.cwiseInverse();
@@ -222,7 +226,7 @@ absl::StatusOr<FitResult> FitToMinimum(const Bundle& bundle, const Problem& prob
     return absl::OutOfRangeError("the adaptation diverged: the meta-learned parameters do not simulate this system");
   }
   const int32_t steps = options.inner_loop.steps;
-  const auto tell = [&](int step, double cost) { return !on_step || on_step({.step = step, .steps = steps, .loss = cost}); };
+  const auto tell = [&](int step, double cost, const Eigen::VectorXd&) { return !on_step || on_step({.step = step, .steps = steps, .loss = cost}); };
   const MapFit fit = FitProximal(least_squares, problem.loss, data, bundle.parameters,
                                  {.proximal = problem.pull, .steps = steps}, &workspace, tell);
   if (fit.stopped) return absl::CancelledError("the adaptation was cancelled");

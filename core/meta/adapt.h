@@ -16,7 +16,9 @@ namespace metaekf::meta {
 enum class AdaptationMethod {
   kGradientDescent,  ///< eq. maml_inner from the meta-learned parameters
   kAdam,             ///< the same loss and start, Adam steps
-  kFromScratch,      ///< Adam from a random initialisation: the supervised baseline
+  /// Without the meta-learned parameters: the baseline. A model whose start is fitted by Levenberg–Marquardt (FitFromScratch),
+  /// any other by Adam from a random initialisation.
+  kFromScratch,
   /// The most probable parameters under the model's prior (FitSystem); of a model that IMPLICIT_MAML has trained with this
   /// optimiser the minimum that it was trained with (FitProximal).
   kLevenbergMarquardt,
@@ -26,7 +28,7 @@ struct AdaptationOptions {
   AdaptationMethod method = AdaptationMethod::kGradientDescent;
   InnerLoopSpec inner_loop;
   uint64_t seed = 0;  ///< of the random initialisation
-  base::Executor* executor = nullptr;  ///< runs starts that compete; nullptr: one after the other. Changes no result
+  base::Executor* executor = base::CallingThread();  ///< runs starts that compete; changes no result
 };
 
 /// What `adapt` does with a model unless told otherwise. Without a method: what its training specification says. The

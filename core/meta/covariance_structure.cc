@@ -87,20 +87,24 @@ FactorModel FitFactors(const MatrixXd& second_moment, Index rank, const FactorOp
   return model;
 }
 
-MatrixXd StructuredCovariance(const GaussianPriorSpec& spec, const Pieces& tensors, const MatrixXd& second_moment) {
+StructuredCovariance FitStructure(const GaussianPriorSpec& spec, const Pieces& tensors, const MatrixXd& second_moment) {
   switch (spec.covariance) {
     case PriorCovariance::kFull:
-      return second_moment;
+      break;
     case PriorCovariance::kBlock:
-      return BlockDiagonal(tensors, second_moment);
+      return {.covariance = BlockDiagonal(tensors, second_moment)};
     case PriorCovariance::kLowRank:
-      return FitFactors(second_moment, spec.rank).Covariance();
+    case PriorCovariance::kManifold: {
+      const FactorModel model = FitFactors(second_moment, spec.rank);
+      const Index used = (model.loadings.colwise().squaredNorm().array() > 0).count();  // the largest come first
+      return {model.Covariance(), model.loadings.leftCols(used)};
+    }
   }
-  return second_moment;
+  return {.covariance = second_moment};
 }
 
 absl::Status CheckStructure(const GaussianPriorSpec& spec, Index parameters) {
-  if (spec.covariance != PriorCovariance::kLowRank || spec.rank <= parameters) return absl::OkStatus();
+  if (spec.rank <= parameters) return absl::OkStatus();  // 0 where there are no factors
   return absl::InvalidArgumentError(
       absl::StrCat("gaussian_prior.rank: ", spec.rank, " is more than the ", parameters, " parameters that adapt"));
 }

@@ -39,12 +39,16 @@ struct FactorOptions {
 /// follows from the matrix determinant and inversion lemmas.
 FactorModel FitFactors(const Eigen::MatrixXd& second_moment, Eigen::Index rank, const FactorOptions& options = {});
 
+struct StructuredCovariance {
+  Eigen::MatrixXd covariance;
+  Eigen::MatrixXd loadings;  ///< V, those of its columns that are not zero; empty where there are no factors
+};
+
 /// The most likely covariance of the structure that a prior is given, from the second moment C of a fleet's parameters:
-/// C itself (kFull), its blocks of each tensor (kBlock), V Vᵀ + D (kLowRank, FitFactors). All maximise ℓ above.
+/// C itself (kFull), its blocks of each tensor (kBlock), V Vᵀ + D (kLowRank and kManifold, FitFactors). All maximise ℓ above.
 ///
 /// @param tensors  what adapts, piece by piece; their sizes add up to p.
-Eigen::MatrixXd StructuredCovariance(const GaussianPriorSpec& spec, const Pieces& tensors,
-                                     const Eigen::MatrixXd& second_moment);
+StructuredCovariance FitStructure(const GaussianPriorSpec& spec, const Pieces& tensors, const Eigen::MatrixXd& second_moment);
 
 /// Errors: InvalidArgument naming gaussian_prior.rank if it exceeds the number of parameters that adapt.
 absl::Status CheckStructure(const GaussianPriorSpec& spec, Eigen::Index parameters);

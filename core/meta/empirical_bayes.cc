@@ -56,6 +56,7 @@ class SlotWorkspace {
 /// Fits of all systems of a fleet under one belief, and the next belief.
 struct Population {
   Belief belief;
+  MatrixXd loadings;  // of kManifold
   std::vector<VectorXd> fits;
   std::vector<bool> accepted;
 };
@@ -149,6 +150,7 @@ class Learner {
     std::vector<double> mean_squares(count);
     std::vector<VectorXd> variances(count);
     LearnedPrior current = Current();
+    current.prior.loadings.resize(0, 0);  // what a system has off the manifold is what D is learned from
     for (size_t first = 0; first < count; first += kBatch) {
       const size_t batch = std::min(kBatch, count - first);
       if (round_ == 0) current.prior.examples = Examples(first);
@@ -163,7 +165,10 @@ class Learner {
                             workspaces_[slot].For(plan_.dynamics, data_[s].shape));
         const MapFit& fit = found.ok() && !(own.cost <= found->fit.cost) ? found->fit : own;
         population_.fits[s] = fit.unknowns;
-        covariances[s] = linalg::Cholesky(fit.information).Inverse();
+        const linalg::Cholesky factor(fit.information);
+        mean_squares[s] = std::numeric_limits<double>::infinity();
+        if (!factor.ok()) return;  // a fit that failed: it is not accepted
+        covariances[s] = factor.Inverse();
         const double samples = static_cast<double>(Samples(data_[s]));
         const double determined =
             static_cast<double>(fit.unknowns.size()) - (covariances[s] * belief.precision).trace();
@@ -174,15 +179,18 @@ class Learner {
       METAEKF_RETURN_IF_ERROR(Tell(batch));
     }
     state_.training_loss = Median(mean_squares) * belief.noise_variance.minCoeff();
-    Maximise(mean_squares, variances, covariances, &population_);
+    METAEKF_RETURN_IF_ERROR(Maximise(mean_squares, variances, covariances, &population_));
     return absl::OkStatus();
   }
 
-  void Maximise(const std::vector<double>& mean_squares, const std::vector<VectorXd>& variances,
-                const std::vector<MatrixXd>& covariances, Population* population) const {
+  absl::Status Maximise(const std::vector<double>& mean_squares, const std::vector<VectorXd>& variances,
+                        const std::vector<MatrixXd>& covariances, Population* population) const {
     std::vector<double> finite;
     for (const double value : mean_squares) finite.push_back(std::isfinite(value) ? value : std::numeric_limits<double>::max());
     const double limit = kStalled * Median(finite);
+    if (!std::isfinite(limit)) {
+      return absl::OutOfRangeError("the training diverged: half of the systems or more have no fit; another seed may help");
+    }
     const Index adapted = plan_.dynamics.adapted_size(), size = population->belief.mean.size(), starts = size - adapted;
     double count = 0;
     VectorXd mean = VectorXd::Zero(size);
@@ -202,11 +210,15 @@ class Learner {
     }
     covariance.topRightCorner(adapted, starts).setZero();
     covariance.bottomLeftCorner(starts, adapted).setZero();
-    covariance.topLeftCorner(adapted, adapted) =
-        StructuredCovariance(options_, plan_.dynamics.adapted(), covariance.topLeftCorner(adapted, adapted));
+    const StructuredCovariance structured =
+        FitStructure(options_, plan_.dynamics.adapted(), covariance.topLeftCorner(adapted, adapted));
+    covariance.topLeftCorner(adapted, adapted) = structured.covariance;
+    if (options_.covariance == PriorCovariance::kManifold) population->loadings = structured.loadings;
     Belief& belief = population->belief;
     belief.mean = mean;
-    belief.precision = linalg::Cholesky(covariance).Inverse();
+    const linalg::Cholesky factor(covariance);
+    if (!factor.ok()) return absl::OutOfRangeError("the training diverged: the fits of the fleet have no covariance");
+    belief.precision = factor.Inverse();
     for (Index c = 0; c < belief.noise_variance.size(); ++c) {
       if (!std::isfinite(belief.noise_variance[c])) continue;
       std::vector<double> of_channel;
@@ -215,6 +227,7 @@ class Learner {
       }
       belief.noise_variance[c] = Median(of_channel);
     }
+    return absl::OkStatus();
   }
 
   /// What the population says of a new system.
@@ -227,6 +240,7 @@ class Learner {
     prior.start = population_.belief.precision.bottomRightCorner(n, n);
     prior.noise_variance = population_.belief.noise_variance;
     prior.examples = Examples(population_.fits.size());
+    prior.loadings = population_.loadings;
     return current;
   }
 
@@ -336,6 +350,7 @@ class Learner {
     state_.values["best_start"] = Flat(best_.prior.start);
     state_.values["best_noise_variance"] = Flat(best_.prior.noise_variance);
     state_.values["best_examples"] = Flat(best_.prior.examples);
+    if (best_.prior.loadings.size() > 0) state_.values["best_loadings"] = Flat(best_.prior.loadings);
   }
 
   absl::Status Restore() {
@@ -370,6 +385,7 @@ class Learner {
       best_.prior.start = matrix("best_start", n, n);
       best_.prior.noise_variance = matrix("best_noise_variance", channels, 1);
       best_.prior.examples = matrix("best_examples", p, -1);
+      best_.prior.loadings = matrix("best_loadings", p, -1);
       if (static_cast<int64_t>(best_.parameters.size()) != model_.layout().size()) {
         return absl::InvalidArgumentError("the checkpoint's \"best_parameters\" is not the model's");
       }

@@ -1,10 +1,8 @@
 #include "core/meta/fit_plan.h"
 
 #include <algorithm>
-#include <atomic>
 #include <cmath>
 #include <memory>
-#include <mutex>
 
 #include "core/base/status.h"
 #include "core/data/split.h"
@@ -67,6 +65,7 @@ absl::Status FitPlan::CheckPrior(const GaussianPrior& prior) const {
   METAEKF_RETURN_IF_ERROR(check("dynamics", prior.dynamics, p, p));
   METAEKF_RETURN_IF_ERROR(check("start", prior.start, n, n));
   METAEKF_RETURN_IF_ERROR(check("noise_variance", prior.noise_variance, dynamics.channels(), 1));
+  if (prior.loadings.size() > 0) METAEKF_RETURN_IF_ERROR(check("loadings", prior.loadings, p, prior.loadings.cols()));
   if (prior.examples.size() == 0) return absl::OkStatus();
   return check("examples", prior.examples, p, prior.examples.cols());
 }
@@ -81,9 +80,19 @@ Belief FitPlan::BeliefOf(const GaussianPrior& prior, const std::vector<double>& 
 
 namespace {
 
+/// [V 0; 0 I]: what may vary under a prior with loadings; else empty.
+MatrixXd DirectionsOf(const GaussianPrior& prior) {
+  if (prior.loadings.size() == 0) return {};
+  const Index p = prior.loadings.rows(), k = prior.loadings.cols(), n = prior.start.rows();
+  MatrixXd directions = MatrixXd::Zero(p + n, k + n);
+  directions.topLeftCorner(p, k) = prior.loadings;
+  directions.bottomRightCorner(n, n).setIdentity();
+  return directions;
+}
+
 /// The mean and those examples that are the most probable, each with a start c₀ fitted to the first samples.
 absl::StatusOr<std::vector<Candidate>> Screen(const FitPlan& plan, const GaussianPrior& prior, const std::vector<double>& mean,
-                                              const Belief& belief, const Trajectory& normalised) {
+                                              const Belief& belief, const MatrixXd& directions, const Trajectory& normalised) {
   METAEKF_ASSIGN_OR_RETURN(const Trajectory head,
                            data::FirstSamples(normalised, std::min(normalised.length(), kScreeningSamples)));
   const RolloutLeastSquares& screened = plan.start ? *plan.start : plan.dynamics;
@@ -97,6 +106,7 @@ absl::StatusOr<std::vector<Candidate>> Screen(const FitPlan& plan, const Gaussia
   for (Index i = -1; i < prior.examples.cols(); ++i) {
     Candidate candidate{.unknowns = belief.mean};
     if (i >= 0) candidate.unknowns.head(adapted) = prior.examples.col(i);
+    if (directions.size() > 0) candidate.unknowns = belief.mean + directions * CoordinatesNear(belief, directions, candidate.unknowns);
     std::vector<double> parameters = mean;
     ScatterAdapted(plan.dynamics, candidate.unknowns, &parameters);
     if (plan.start) {
@@ -122,49 +132,49 @@ absl::StatusOr<std::vector<Candidate>> Screen(const FitPlan& plan, const Gaussia
 
 absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& prior, const std::vector<double>& mean,
                                     const Trajectory& normalised, const SystemFitOptions& options,
-                                    const std::function<bool(int, double)>& on_step) {
+                                    const OnFitStep& on_step) {
   METAEKF_RETURN_IF_ERROR(plan.CheckPrior(prior));
   const Belief belief = plan.BeliefOf(prior, mean);
+  const MatrixXd directions = DirectionsOf(prior);
   METAEKF_ASSIGN_OR_RETURN(const LossData<double> data, plan.dynamics.Cut(normalised));
   std::vector<Candidate> candidates{{.unknowns = options.from, .damping = kContinuedDamping}};
   if (options.from.size() == 0) {
-    METAEKF_ASSIGN_OR_RETURN(candidates, Screen(plan, prior, mean, belief, normalised));
+    METAEKF_ASSIGN_OR_RETURN(candidates, Screen(plan, prior, mean, belief, directions, normalised));
   }
   if (candidates.empty()) {
     return absl::OutOfRangeError("the fit diverged: neither the meta-learned parameters nor any example simulate this system");
   }
   SystemFit result{.parameters = mean};
-  std::mutex telling;
-  std::atomic<bool> stopped = false;
-  const auto tell = [&](int step, double cost) {
-    const std::lock_guard lock(telling);
-    if (!stopped && on_step && !on_step(step, cost)) stopped = true;
-    return !stopped.load();
-  };
-  const std::unique_ptr<base::Executor> serial = base::MakeSerialExecutor();
-  base::Executor& executor = options.executor != nullptr ? *options.executor : *serial;
-  std::vector<std::unique_ptr<RolloutLeastSquares::Workspace>> workspaces(executor.concurrency());
+  FitProgress progress(on_step);
+  const OnIteration tell = [&progress](int step, double cost, const VectorXd&) { return progress.Tell(step, cost); };
+  std::vector<std::unique_ptr<RolloutLeastSquares::Workspace>> workspaces(options.executor->concurrency());
   const auto workspace = [&](size_t slot) {
     if (!workspaces[slot]) workspaces[slot] = std::make_unique<RolloutLeastSquares::Workspace>(plan.dynamics, data.shape);
     return workspaces[slot].get();
   };
   if (candidates.size() > 1) {
-    executor.ParallelFor(candidates.size(), [&](size_t i, size_t slot) {
-      if (stopped) return;
+    options.executor->ParallelFor(candidates.size(), [&](size_t i, size_t slot) {
+      if (progress.stopped()) return;
       const MapFit fit = FitMap(plan.dynamics, data, mean, belief, candidates[i].unknowns,
                                 {.optimiser = {.max_iterations = std::min(kContenderSteps, options.steps),
-                                               .tolerance = kContenderTolerance}},
+                                               .tolerance = kContenderTolerance},
+                                 .directions = directions},
                                 workspace(slot), tell);
       candidates[i] = {fit.cost, fit.unknowns, fit.damping};
     });
     std::stable_sort(candidates.begin(), candidates.end(), Cheaper);
   }
   result.fit = FitMap(plan.dynamics, data, mean, belief, candidates[0].unknowns,
-                      {.optimiser = {.max_iterations = stopped ? 0 : options.steps,
+                      {.optimiser = {.max_iterations = progress.stopped() ? 0 : options.steps,
                                      .tolerance = options.tolerance,
                                      .initial_damping = candidates[0].damping},
-                       .noise_samples = options.noise_samples},
+                       .noise_samples = options.noise_samples,
+                       .directions = directions},
                       workspace(0), tell);
+  if (directions.size() > 0) {
+    result.fit.unknowns.head(prior.loadings.rows()) =
+        nssm::AlongLoadings(prior, belief.mean.head(prior.loadings.rows()), result.fit.coordinates.head(prior.loadings.cols()));
+  }
   ScatterAdapted(plan.dynamics, result.fit.unknowns, &result.parameters);
   return result;
 }

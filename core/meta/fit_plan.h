@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "core/base/executor.h"
+#include "core/meta/fit_progress.h"
 #include "core/meta/map_fit.h"
 #include "core/nssm/prior.h"
 
@@ -35,21 +36,20 @@ struct SystemFitOptions {
   double noise_samples = 200;
   /// Unknowns of a fit to the head of the same recording: the fit goes on from them alone. Empty: it looks for a start.
   Eigen::VectorXd from;
-  base::Executor* executor = nullptr;  ///< runs starts that compete; nullptr: one after the other
+  base::Executor* executor = base::CallingThread();  ///< runs starts that compete
 };
 
-/// Fits a system under a prior.
+/// Fits a system under a prior: where it has loadings, along those alone (ω = ω₀ + V z, MapFit::coordinates being z and c₀).
 ///
 /// It starts from the mean and from those of the prior's examples under which the first samples are most probable, each with
 /// a start c₀ fitted to them. All go on for some steps, the best of them to the end.
 ///
 /// @param mean        ω₀.
 /// @param normalised  the context, in normalised units.
-/// @param on_step     called with (step, Φ) after every step of the fits, by one thread at a time; false stops, with the
-///                    best so far.
+/// @param on_step     called by one thread at a time; false stops all fits, with the best so far.
 /// Errors: FailedPrecondition if the context is too short; OutOfRange if no start gives a finite cost.
 absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const nssm::GaussianPrior& prior, const std::vector<double>& mean,
                                     const data::Trajectory& normalised, const SystemFitOptions& options,
-                                    const std::function<bool(int, double)>& on_step);
+                                    const OnFitStep& on_step);
 
 }  // namespace metaekf::meta

@@ -25,7 +25,7 @@ constexpr double kNothing = 1e-3;  // of the tolerance: a step that promises les
 
 LevenbergMarquardtResult MinimiseLevenbergMarquardt(const Objective& objective, const VectorXd& x,
                                                     const LevenbergMarquardtOptions& options,
-                                                    const std::function<bool(int, double)>& on_iteration) {
+                                                    const OnIteration& on_iteration) {
   LevenbergMarquardtResult result{.x = x};
   objective.linearise(result.x, &result.model);
   result.damping = options.initial_damping;
@@ -74,7 +74,7 @@ LevenbergMarquardtResult MinimiseLevenbergMarquardt(const Objective& objective, 
     const double ratio = gained / promised;
     damping *= std::max(1.0 / 3, 1 - std::pow(2 * ratio - 1, 3));
     growth = 2;
-    if (on_iteration && !on_iteration(result.iterations, result.model.cost)) {
+    if (on_iteration && !on_iteration(result.iterations, result.model.cost, result.x)) {
       result.stopped = true;
       break;
     }

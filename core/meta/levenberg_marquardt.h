@@ -28,6 +28,9 @@ struct LevenbergMarquardtOptions {
   double initial_damping = 1;    ///< of the curvature's diagonal; less leaps out of the basin that the start is in
 };
 
+/// Called after every accepted step with its number, Φ and x; false stops.
+using OnIteration = std::function<bool(int iteration, double cost, const Eigen::VectorXd& x)>;
+
 struct LevenbergMarquardtResult {
   Eigen::VectorXd x;
   QuadraticModel model;  ///< at x
@@ -50,9 +53,9 @@ struct LevenbergMarquardtResult {
 /// as long as the correction is small beside the step
 /// (M. K. Transtrum, J. P. Sethna, Improvements to the Levenberg–Marquardt algorithm, arXiv:1201.5885, 2012).
 ///
-/// @param on_iteration  called with (iteration, Φ) after every accepted step; false stops. May be empty.
+/// @param on_iteration  may be empty.
 LevenbergMarquardtResult MinimiseLevenbergMarquardt(const Objective& objective, const Eigen::VectorXd& x,
                                                     const LevenbergMarquardtOptions& options,
-                                                    const std::function<bool(int, double)>& on_iteration);
+                                                    const OnIteration& on_iteration);
 
 }  // namespace metaekf::meta

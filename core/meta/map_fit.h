@@ -20,7 +20,9 @@ struct Belief {
 /// The most probable unknowns of one system, and how sure they are.
 struct MapFit {
   Eigen::VectorXd unknowns;
-  Eigen::MatrixXd information;     ///< Λ + Jᵀ W J at the optimum: the inverse of the posterior covariance (Laplace)
+  Eigen::VectorXd coordinates;     ///< along the directions that were free, where not all are
+  /// Λ + Jᵀ W J at the optimum, the inverse of the posterior covariance (Laplace): of the unknowns, or of the coordinates.
+  Eigen::MatrixXd information;
   Eigen::VectorXd noise_variance;  ///< as estimated from the residuals, with the belief's worth `noise_samples` samples
   Eigen::VectorXd channel_squares; ///< Σ r² of every channel
   double cost = 0;                 ///< ½ Σ w r² + ½ (θ − m)ᵀ Λ (θ − m)
@@ -34,18 +36,21 @@ struct MapFitOptions {
   LevenbergMarquardtOptions optimiser;
   /// How many samples' worth of evidence the belief's noise variance counts for; infinite: it is not estimated.
   double noise_samples = std::numeric_limits<double>::infinity();
-  /// Sees the unknowns before the first step and after every one.
-  std::function<void(const Eigen::VectorXd&)> inspect;
+  /// B, n × k, of full rank: the unknowns are m + B z, and z is free. Empty: all of them are.
+  Eigen::MatrixXd directions;
 };
+
+/// z of the m + B z that is the most probable of all near x: the least (x − m − B z)ᵀ Λ (x − m − B z).
+Eigen::VectorXd CoordinatesNear(const Belief& belief, const Eigen::MatrixXd& directions, const Eigen::VectorXd& x);
 
 /// Minimises ½ Σ_c Σ r_c²/σ_c² + ½ (θ − m)ᵀ Λ (θ − m) over the unknowns θ.
 ///
 /// @param parameters  ω, of which the adapted part is not read.
-/// @param from        where to start.
+/// @param from        where to start; with directions at what is near it.
 MapFit FitMap(const nssm::RolloutLeastSquares& problem, const nssm::LossData<double>& data,
               const std::vector<double>& parameters, const Belief& belief, const Eigen::VectorXd& from,
               const MapFitOptions& options, nssm::RolloutLeastSquares::Workspace* workspace,
-              const std::function<bool(int, double)>& on_iteration = nullptr);
+              const OnIteration& on_iteration = nullptr);
 
 /// Puts the adapted part of `unknowns` into ω, and the other way round.
 void ScatterAdapted(const nssm::RolloutLeastSquares& problem, const Eigen::VectorXd& unknowns,

@@ -17,6 +17,7 @@ namespace {
 
 constexpr int kSettlingSteps = 10;  // of Newton, at most
 constexpr int kPowerSteps = 30;
+constexpr double kPowerTolerance = 0.01;  // relative
 constexpr double kSettled = 0.25;   // of the last squared slope: one that falls no further is down to rounding
 
 nn::Mask AllOf(const nssm::Model& model) { return nn::Mask(model.layout().tensors().size(), true); }
@@ -173,7 +174,9 @@ std::vector<double> MetaGradient<T>::Curvatures(const T* variables, const LossDa
       v /= length;
       inner_.HessianVector(variables, context, v.data(), product.data(), scratch->inner_);
       v.segment(offset, size) = product.segment(offset, size);
+      const double last = curvature;
       curvature = static_cast<double>(v.norm());
+      if (std::fabs(curvature - last) <= kPowerTolerance * curvature) break;
     }
     curvatures.push_back(curvature);
   }

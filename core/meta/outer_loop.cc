@@ -37,14 +37,25 @@ double LearningRate(const TrainingSpec& spec, int32_t iteration) {
              : CosineDecay(spec.outer_lr, spec.final_outer_lr, iteration - warmup, spec.iterations - warmup);
 }
 
-/// The warm-up is a training of its own: supervised, with short rollouts.
-TrainingSpec WarmupSpec(const TrainingSpec& spec) {
-  TrainingSpec warmup = spec;
-  warmup.algorithm = Algorithm::kSupervised;
-  if (spec.loss.horizon == nssm::LossSpec::kWholeSet || spec.loss.horizon > spec.warmup_horizon) {
-    warmup.loss.horizon = spec.warmup_horizon;
-  }
-  return warmup;
+/// Steps of the longest rollouts that an iteration has: short in the warm-up, then doubling at even distances while they grow.
+int32_t HorizonOf(const TrainingSpec& spec, int32_t iteration) {
+  const int32_t full = spec.loss.horizon == nssm::LossSpec::kWholeSet
+                           ? nssm::ShapeOfLoss(spec.model, spec.loss, spec.context_samples)->horizon
+                           : spec.loss.horizon;
+  const int32_t first = std::min(spec.warmup_horizon, full), step = iteration - spec.warmup_iterations;
+  if (step < 0) return first;
+  if (step >= spec.horizon_growth_iterations) return full;
+  const int32_t lengths = static_cast<int32_t>(std::ceil(std::log2(static_cast<double>(full) / first)));
+  if (lengths == 0) return full;
+  return first << (int64_t{step} * lengths / spec.horizon_growth_iterations);
+}
+
+/// What an iteration trains by. The warm-up is a training of its own: supervised.
+TrainingSpec SpecOf(const TrainingSpec& spec, int32_t iteration) {
+  TrainingSpec own = spec;
+  if (iteration < spec.warmup_iterations) own.algorithm = Algorithm::kSupervised;
+  if (HorizonOf(spec, iteration) != HorizonOf(spec, spec.iterations)) own.loss.horizon = HorizonOf(spec, iteration);
+  return own;
 }
 
 /// One phase of training: what a loss and an algorithm need to be drawn and evaluated.
@@ -94,9 +105,9 @@ class Phase {
       const Trajectory& system = systems_.training[rng.Index(systems_.training.size())];
       of_systems[index] = meta_gradient_.Curvatures(parameters.data(), DrawContext(system, &rng), &scratch_[slot]);
     });
-    std::vector<double> largest = of_systems.front();
+    std::vector<double> largest(of_systems.front().size());
     for (const std::vector<double>& own : of_systems) {
-      for (size_t l = 0; l < largest.size(); ++l) largest[l] = std::max(largest[l], own[l]);
+      for (size_t l = 0; l < largest.size(); ++l) largest[l] = std::max(largest[l], own[l]);  // no number: does not count
     }
     return largest;
   }
@@ -217,11 +228,8 @@ class OuterLoop {
         systems_(systems),
         state_(state),
         schedule_(spec),
-        main_(spec, model, mask, systems, executor) {
-    if (schedule_.iteration(state->iteration) < spec.warmup_iterations || schedule_.screens(state->iteration)) {
-      warmup_.emplace(WarmupSpec(spec), model, mask, systems, executor);
-    }
-  }
+        executor_(executor),
+        main_(spec, model, mask, systems, executor) {}
 
   /// Errors: those of RunOuterLoop.
   absl::Status Run(const OnTrainingStep& on_step) {
@@ -236,7 +244,9 @@ class OuterLoop {
         if (on_step) on_step({.state = *state_, .iterations = schedule_.steps(), .diverged = true});
         return stepped;
       }
-      const bool validate = stepped.ok() && !systems_.validation.empty() &&
+      // Rates that stand for multiples still adapt nothing.
+      const bool judgeable = !spec_.inner_loop.curvature_rates || iteration >= spec_.warmup_iterations;
+      const bool validate = stepped.ok() && judgeable && !systems_.validation.empty() &&
                             ((iteration + 1) % spec_.validation_period == 0 || iteration + 1 == spec_.iterations ||
                              schedule_.ends_start(state_->iteration));
       if (validate) Validate();
@@ -291,19 +301,31 @@ class OuterLoop {
 
   // ---- steps ----
 
+  /// The phase that an iteration is in; one before the main one is kept until another is asked for.
+  Phase<T>& PhaseOf(int32_t iteration) {
+    const TrainingSpec own = SpecOf(spec_, iteration);
+    if (own.algorithm == spec_.algorithm && own.loss.horizon == spec_.loss.horizon) return main_;
+    if (!early_ || early_spec_.algorithm != own.algorithm || early_spec_.loss.horizon != own.loss.horizon) {
+      early_spec_ = own;
+      early_.emplace(own, model_, mask_, systems_, executor_);
+    }
+    return *early_;
+  }
+
   /// @param iteration  of the training, from 0 on, that this step is.
   absl::Status Step(int32_t iteration) {
     std::vector<double>& parameters = state_->values[kParameters];
     std::vector<double>& first_moment = state_->values[kFirstMoment];
     std::vector<double>& second_moment = state_->values[kSecondMoment];
     const bool warming_up = iteration < spec_.warmup_iterations;
+    Phase<T>& phase = PhaseOf(iteration);
     if (iteration == spec_.warmup_iterations) {
       // Another loss: the warm-up's squared gradients would throttle the first thousand steps on it.
       std::fill(first_moment.begin(), first_moment.end(), 0.0);
       std::fill(second_moment.begin(), second_moment.end(), 0.0);
       if (spec_.inner_loop.curvature_rates) ScaleRates(main_.Curvatures(parameters), &parameters);
     }
-    const double loss = (warming_up ? *warmup_ : main_).Gradient(iteration, parameters, &gradient_);
+    const double loss = phase.Gradient(iteration, parameters, &gradient_);
     const double norm = ClipNorm(spec_.clip_norm, &gradient_);
     const int32_t step = iteration + 1 - (warming_up ? 0 : spec_.warmup_iterations);
     const double first_loss = step == 1 ? loss : state_->values[kFirstLoss].front();
@@ -323,11 +345,13 @@ class OuterLoop {
     return absl::OkStatus();
   }
 
-  /// Rates that have stood for multiples of 1/λ become those: the loss is that of the main phase from here on.
+  /// Rates that have stood for multiples of 1/(L λ) become those: the loss is that of the main phase from here on. With L
+  /// tensors of curvatures λ_l the Hessian is at most L diag(λ_l I): a Hessian without negative curvature is a Gram matrix of
+  /// L blocks, |Σ_l J_l d_l|² ≤ L Σ_l λ_l |d_l|².
   void ScaleRates(const std::vector<double>& curvatures, std::vector<double>* variables) const {
     const size_t first = variables->size() - curvatures.size();
     for (size_t l = 0; l < curvatures.size(); ++l) {
-      if (curvatures[l] > 0) (*variables)[first + l] -= std::log(curvatures[l]);
+      if (curvatures[l] > 0) (*variables)[first + l] -= std::log(static_cast<double>(curvatures.size()) * curvatures[l]);
     }
     nssm::RoundToPrecision(spec_.model.precision, variables);
   }
@@ -347,8 +371,10 @@ class OuterLoop {
   TrainingState* state_;
   const Schedule schedule_;
   std::optional<TrainingState> good_;  // at the newest loss and gradient that were numbers
+  base::Executor* executor_;
   Phase<T> main_;
-  std::optional<Phase<T>> warmup_;
+  std::optional<Phase<T>> early_;  // of the warm-up, or of rollouts that grow
+  TrainingSpec early_spec_;
   std::vector<double> gradient_;
 };
 

@@ -19,7 +19,7 @@ VectorXd VarianceOfLoss(const nssm::RolloutLeastSquares& problem, const nssm::Lo
 
 MapFit FitProximal(const nssm::RolloutLeastSquares& problem, const nssm::LossSpec& loss, const nssm::LossData<double>& data,
                    const std::vector<double>& start, const ProximalFitOptions& options,
-                   nssm::RolloutLeastSquares::Workspace* workspace, const std::function<bool(int, double)>& on_iteration) {
+                   nssm::RolloutLeastSquares::Workspace* workspace, const OnIteration& on_iteration) {
   const Index p = problem.adapted_size();
   const Belief belief{.mean = GatherAdapted(problem, start),
                       .precision = options.proximal * MatrixXd::Identity(p, p),

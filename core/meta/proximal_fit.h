@@ -27,7 +27,7 @@ struct ProximalFitOptions {
 MapFit FitProximal(const nssm::RolloutLeastSquares& problem, const nssm::LossSpec& loss, const nssm::LossData<double>& data,
                    const std::vector<double>& start, const ProximalFitOptions& options,
                    nssm::RolloutLeastSquares::Workspace* workspace,
-                   const std::function<bool(int, double)>& on_iteration = nullptr);
+                   const OnIteration& on_iteration = nullptr);
 
 /// 1/w of every channel under which Φ of RolloutLeastSquares is L. Infinite where L does not look at the channel.
 Eigen::VectorXd VarianceOfLoss(const nssm::RolloutLeastSquares& problem, const nssm::LossSpec& loss,

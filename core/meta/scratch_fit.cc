@@ -1,11 +1,9 @@
 #include "core/meta/scratch_fit.h"
 
 #include <algorithm>
-#include <atomic>
 #include <cmath>
 #include <limits>
-#include <memory>
-#include <mutex>
+#include <optional>
 
 #include "core/base/status.h"
 #include "core/data/split.h"
@@ -30,7 +28,6 @@ constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
 /// Looks at a fit on its way. @param parameters  ω, whose adapted part is in the unknowns.
 using Inspect = std::function<void(const std::vector<double>& parameters, const VectorXd& unknowns)>;
-using OnStep = std::function<bool(int, double)>;
 
 /// The fits of one system, from any start.
 class ScratchFits {
@@ -49,7 +46,7 @@ class ScratchFits {
   /// From one start, rollouts growing to their full length.
   /// @param data  the recording, cut. @param inspect  sees the fit at full length alone.
   SystemFit Fit(size_t restart, const Trajectory& recording, const LossData<double>& data, const Inspect& inspect,
-                const OnStep& on_step) const {
+                FitProgress* progress) const {
     const uint64_t seed = options_.seed + restart;
     const absl::StatusOr<std::vector<double>> linear = LinearStart(model_, recording, seed);
     SystemFit result{.parameters = linear.ok() ? *linear : model_.InitialParameters(seed)};
@@ -60,22 +57,25 @@ class ScratchFits {
       for (shorter.horizon = 1; shorter.horizon < data.shape.horizon && !result.fit.stopped; shorter.horizon *= kHorizonGrowth) {
         const RolloutLeastSquares problem(model_, shorter, plan_.dynamics.mask(), false);
         const absl::StatusOr<LossData<double>> rollouts = problem.Cut(recording);
-        if (rollouts.ok()) Continue(problem, *rollouts, options_.steps, nullptr, on_step, &result);
+        if (rollouts.ok()) Continue(problem, *rollouts, options_.steps, nullptr, progress, &result);
       }
     }
-    Continue(plan_.dynamics, data, result.fit.stopped ? 0 : options_.steps, inspect, on_step, &result);
+    Continue(plan_.dynamics, data, result.fit.stopped ? 0 : options_.steps, inspect, progress, &result);
     ScatterAdapted(plan_.dynamics, result.fit.unknowns, &result.parameters);
     return result;
   }
 
   /// Goes on from the unknowns of a fit.
   void Continue(const RolloutLeastSquares& problem, const LossData<double>& data, int steps, const Inspect& inspect,
-                const OnStep& on_step, SystemFit* fit) const {
+                FitProgress* progress, SystemFit* fit) const {
     RolloutLeastSquares::Workspace workspace(problem, data.shape);
-    MapFitOptions options{.optimiser = {.max_iterations = steps, .tolerance = kTolerance}};
-    if (inspect) options.inspect = [&](const VectorXd& unknowns) { inspect(fit->parameters, unknowns); };
     const VectorXd from = fit->fit.unknowns;
-    fit->fit = FitMap(problem, data, fit->parameters, belief_, from, options, &workspace, on_step);
+    if (inspect) inspect(fit->parameters, from);
+    fit->fit = FitMap(problem, data, fit->parameters, belief_, from, {.optimiser = {.max_iterations = steps, .tolerance = kTolerance}},
+                      &workspace, [&](int step, double cost, const VectorXd& unknowns) {
+                        if (inspect) inspect(fit->parameters, unknowns);
+                        return progress->Tell(step, cost);
+                      });
   }
 
  private:
@@ -94,16 +94,16 @@ struct HeldOut {
   LossData<double> tail_data;  // where the start is fitted, the whole recording: the tail is simulated from there
 };
 
-/// Errors: FailedPrecondition if the recording is too short to hold anything out.
-absl::StatusOr<HeldOut> HoldOut(const FitPlan& plan, const nssm::Model& model, const Trajectory& recording) {
+/// Nothing if the recording is too short to hold anything out.
+std::optional<HeldOut> HoldOut(const FitPlan& plan, const nssm::Model& model, const Trajectory& recording) {
   const int64_t samples = std::max<int64_t>(recording.length() / kTailShare, model.spec().warmup() + 1);
-  if (samples >= recording.length()) return absl::FailedPreconditionError("nothing would be left to fit");
-  HeldOut result;
-  METAEKF_ASSIGN_OR_RETURN(result.head, data::FirstSamples(recording, recording.length() - samples));
-  METAEKF_ASSIGN_OR_RETURN(result.head_data, plan.dynamics.Cut(result.head));
-  METAEKF_ASSIGN_OR_RETURN(const Trajectory tail, data::SamplesFrom(recording, recording.length() - samples));
-  METAEKF_ASSIGN_OR_RETURN(result.tail_data, plan.dynamics.Cut(plan.start ? recording : tail));
-  return result;
+  const absl::StatusOr<Trajectory> head = data::FirstSamples(recording, recording.length() - samples);
+  const absl::StatusOr<Trajectory> tail = data::SamplesFrom(recording, recording.length() - samples);
+  if (!head.ok() || !tail.ok()) return std::nullopt;
+  absl::StatusOr<LossData<double>> head_data = plan.dynamics.Cut(*head);
+  absl::StatusOr<LossData<double>> tail_data = plan.dynamics.Cut(plan.start ? recording : *tail);
+  if (!head_data.ok() || !tail_data.ok()) return std::nullopt;
+  return HeldOut{*head, *std::move(head_data), *std::move(tail_data)};
 }
 
 /// ½ Σ w r² over the samples held out. One thread's.
@@ -139,26 +139,17 @@ struct Start {
 
 absl::StatusOr<SystemFit> FitFromScratch(const FitPlan& plan, const nssm::Model& model, const nssm::LossSpec& loss,
                                          const Trajectory& normalised, const FromScratchOptions& options,
-                                         const OnStep& on_step) {
+                                         const OnFitStep& on_step) {
   METAEKF_ASSIGN_OR_RETURN(const LossData<double> whole, plan.dynamics.Cut(normalised));
   const ScratchFits fits(plan, model, loss, options);
-  absl::StatusOr<HeldOut> held_out = absl::FailedPreconditionError("not asked for");
-  if (options.stop_early) held_out = HoldOut(plan, model, normalised);  // a recording too short for that is fitted whole
+  const std::optional<HeldOut> held_out = options.stop_early ? HoldOut(plan, model, normalised) : std::nullopt;
   std::vector<Start> starts(static_cast<size_t>(options.restarts));
-  std::mutex telling;
-  std::atomic<bool> stopped = false;
-  const OnStep tell = [&](int step, double cost) {
-    const std::lock_guard lock(telling);
-    if (!stopped && on_step && !on_step(step, cost)) stopped = true;
-    return !stopped.load();
-  };
-  const std::unique_ptr<base::Executor> serial = base::MakeSerialExecutor();
-  base::Executor& executor = options.executor != nullptr ? *options.executor : *serial;
-  executor.ParallelFor(starts.size(), [&](size_t i, size_t) {
-    if (stopped) return;
+  FitProgress progress(on_step);
+  options.executor->ParallelFor(starts.size(), [&](size_t i, size_t) {
+    if (progress.stopped()) return;
     Start& start = starts[i];
-    if (!held_out.ok()) {
-      start.fit = fits.Fit(i, normalised, whole, nullptr, tell);
+    if (!held_out) {
+      start.fit = fits.Fit(i, normalised, whole, nullptr, &progress);
       start.cost = start.fit.fit.cost;
       return;
     }
@@ -169,7 +160,7 @@ absl::StatusOr<SystemFit> FitFromScratch(const FitPlan& plan, const nssm::Model&
       start.cost = start.last_cost;
       start.unknowns = unknowns;
     };
-    start.fit = fits.Fit(i, held_out->head, held_out->head_data, inspect, tell);
+    start.fit = fits.Fit(i, held_out->head, held_out->head_data, inspect, &progress);
   });
   const auto best = std::min_element(starts.begin(), starts.end(), [](const Start& a, const Start& b) {
     return std::isfinite(a.cost) && (!std::isfinite(b.cost) || a.cost < b.cost);
@@ -177,10 +168,10 @@ absl::StatusOr<SystemFit> FitFromScratch(const FitPlan& plan, const nssm::Model&
   if (best == starts.end() || !std::isfinite(best->cost)) {
     return absl::OutOfRangeError("no start of the fit simulates the system; shorter rollouts or another seed may help");
   }
-  if (held_out.ok()) {
-    const bool to_minimum = best->last_cost <= kOverfit * best->cost && !stopped;
+  if (held_out) {
+    const bool to_minimum = best->last_cost <= kOverfit * best->cost && !progress.stopped();
     best->fit.fit.unknowns = best->unknowns;
-    fits.Continue(plan.dynamics, whole, to_minimum ? options.steps : 0, nullptr, tell, &best->fit);
+    fits.Continue(plan.dynamics, whole, to_minimum ? options.steps : 0, nullptr, &progress, &best->fit);
     ScatterAdapted(plan.dynamics, best->fit.fit.unknowns, &best->fit.parameters);
   }
   SystemFit result = std::move(best->fit);

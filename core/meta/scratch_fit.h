@@ -1,7 +1,5 @@
 #pragma once
 
-#include <functional>
-
 #include "core/base/executor.h"
 #include "core/meta/fit_plan.h"
 
@@ -13,7 +11,7 @@ struct FromScratchOptions {
   int32_t steps = 60;
   /// Holds the recording's tail out, to see where on the way to the minimum it is predicted best, and from which start.
   bool stop_early = false;
-  base::Executor* executor = nullptr;  ///< runs the starts; nullptr: one after the other
+  base::Executor* executor = base::CallingThread();  ///< runs the starts
 };
 
 /// Fits a system of which nothing is known: the best of several starts, each a linear model of the recording (LinearStart)
@@ -24,11 +22,10 @@ struct FromScratchOptions {
 /// fifth is held out: what predicts it best on the way of all starts is the result, unless the end of that way is nearly as
 /// good; then the fit goes on to the minimum of the whole recording.
 ///
-/// @param on_step  called with (step, Φ) after every step of the fits, by one thread at a time; false stops, with the best
-///                 so far.
+/// @param on_step  called by one thread at a time; false stops all fits, with the best so far.
 /// Errors: FailedPrecondition if the recording is too short; OutOfRange if no start gives a finite cost.
 absl::StatusOr<SystemFit> FitFromScratch(const FitPlan& plan, const nssm::Model& model, const nssm::LossSpec& loss,
                                          const data::Trajectory& normalised, const FromScratchOptions& options,
-                                         const std::function<bool(int, double)>& on_step);
+                                         const OnFitStep& on_step);
 
 }  // namespace metaekf::meta

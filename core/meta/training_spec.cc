@@ -19,7 +19,8 @@ const std::vector<std::pair<std::string, Optimiser>> kOptimisers = {{"GRADIENT_D
 
 const std::vector<std::pair<std::string, PriorCovariance>> kPriorCovariances = {{"FULL", PriorCovariance::kFull},
                                                                                 {"LOW_RANK", PriorCovariance::kLowRank},
-                                                                                {"BLOCK", PriorCovariance::kBlock}};
+                                                                                {"BLOCK", PriorCovariance::kBlock},
+                                                                                {"MANIFOLD", PriorCovariance::kManifold}};
 
 constexpr int32_t kGaussianPriorSteps = 60;  // of Levenberg–Marquardt at adaptation
 
@@ -80,11 +81,12 @@ GaussianPriorSpec ReadGaussianPrior(JsonFields* parent) {
   spec.round_steps = positive("round_steps", spec.round_steps);
   spec.covariance = fields.Choice("covariance", spec.covariance, kPriorCovariances);
   spec.rank = positive("rank", spec.rank);
-  if (spec.covariance == PriorCovariance::kLowRank && spec.rank == 0) {
-    fields.Fail("rank", "LOW_RANK needs the number of its factors, 1 at least");
+  const bool has_factors = spec.covariance == PriorCovariance::kLowRank || spec.covariance == PriorCovariance::kManifold;
+  if (has_factors && spec.rank == 0) {
+    fields.Fail("rank", absl::StrCat(NameOf(kPriorCovariances, spec.covariance), " needs the number of its factors, 1 at least"));
   }
-  if (spec.covariance != PriorCovariance::kLowRank && spec.rank > 0) {
-    fields.Fail("rank", absl::StrCat("is that of LOW_RANK; the covariance is ", NameOf(kPriorCovariances, spec.covariance)));
+  if (!has_factors && spec.rank > 0) {
+    fields.Fail("rank", absl::StrCat("is that of LOW_RANK and MANIFOLD; the covariance is ", NameOf(kPriorCovariances, spec.covariance)));
   }
   parent->Include(fields.Finish());
   return spec;
@@ -129,12 +131,26 @@ void CheckInnerLoop(const TrainingSpec& spec, JsonFields* fields) {
   }
 }
 
+/// Whether there is room for rollouts to grow in.
+void CheckHorizonGrowth(const TrainingSpec& spec, JsonFields* fields) {
+  if (spec.horizon_growth_iterations == 0) return;
+  if (spec.algorithm == Algorithm::kGaussianPrior) {
+    fields->Fail("horizon_growth_iterations", "GAUSSIAN_PRIOR has no iterations; its first fits grow their rollouts by themselves");
+  } else if (spec.horizon_growth_iterations >= spec.iterations - spec.warmup_iterations) {
+    fields->Fail("horizon_growth_iterations", absl::StrCat("must leave some of the ", spec.iterations - spec.warmup_iterations,
+                                                           " iterations after the warm-up for rollouts of full length"));
+  }
+}
+
 /// Whether there is something to choose among several starts by.
 void CheckRestarts(const TrainingSpec& spec, JsonFields* fields) {
   if (spec.restarts == 1) return;
   if (spec.algorithm == Algorithm::kGaussianPrior) fields->Fail("restarts", "GAUSSIAN_PRIOR has gaussian_prior.restarts");
   if (spec.screening_iterations == 0 || spec.screening_iterations > spec.iterations) {
     fields->Fail("screening_iterations", absl::StrCat("must be from 1 to the ", spec.iterations, " iterations if there are restarts"));
+  }
+  if (spec.inner_loop.curvature_rates && spec.screening_iterations <= spec.warmup_iterations) {
+    fields->Fail("screening_iterations", "must be more than warmup_iterations if there are restarts and curvature_rates: starts cannot be compared before");
   }
   if (spec.validation_share == 0) fields->Fail("validation_share", "must be positive if there are restarts to choose among");
 }
@@ -170,6 +186,8 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
   spec.screening_iterations = static_cast<int32_t>(fields.Integer("screening_iterations", 0, 0, kMany));
   spec.warmup_iterations = static_cast<int32_t>(fields.Integer("warmup_iterations", 0, 0, kMany));
   spec.warmup_horizon = positive("warmup_horizon", spec.warmup_horizon);
+  spec.horizon_growth_iterations = static_cast<int32_t>(fields.Integer("horizon_growth_iterations", 0, 0, kMany));
+  CheckHorizonGrowth(spec, &fields);
   spec.outer_lr = fields.Number("outer_lr", spec.outer_lr, 0, 1e3);
   spec.warmup_lr = fields.Number("warmup_lr", spec.outer_lr, 0, 1e3);
   spec.final_outer_lr = fields.Number("final_outer_lr", spec.outer_lr, 0, 1e3);
@@ -207,6 +225,7 @@ json ToJson(const TrainingSpec& spec) {
           {"screening_iterations", spec.screening_iterations},
           {"warmup_iterations", spec.warmup_iterations},
           {"warmup_horizon", spec.warmup_horizon},
+          {"horizon_growth_iterations", spec.horizon_growth_iterations},
           {"warmup_lr", spec.warmup_lr},
           {"outer_lr", spec.outer_lr},
           {"final_outer_lr", spec.final_outer_lr},

@@ -25,7 +25,7 @@ struct InnerLoopSpec {
   std::map<std::string, double> tensor_rates;  ///< by the tensor's name; the others' is learning_rate
 };
 
-enum class PriorCovariance { kFull, kLowRank, kBlock };
+enum class PriorCovariance { kFull, kLowRank, kBlock, kManifold };
 
 /// Empirical Bayes: the message GaussianPriorSpec of spec.proto.
 struct GaussianPriorSpec {
@@ -35,7 +35,7 @@ struct GaussianPriorSpec {
   int32_t first_steps = 60;
   int32_t round_steps = 10;
   PriorCovariance covariance = PriorCovariance::kFull;
-  int32_t rank = 0;  ///< R of kLowRank, else 0
+  int32_t rank = 0;  ///< R of kLowRank and kManifold, else 0
 };
 
 /// The message ImplicitMamlSpec of spec.proto.
@@ -62,6 +62,7 @@ struct TrainingSpec {
   int32_t screening_iterations = 0;
   int32_t warmup_iterations = 0;
   int32_t warmup_horizon = 10;
+  int32_t horizon_growth_iterations = 0;
   double warmup_lr = 1e-3;
   double outer_lr = 1e-3;
   double final_outer_lr = 1e-3;

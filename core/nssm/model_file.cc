@@ -2,6 +2,7 @@
 
 #include <algorithm>
 
+#include "absl/strings/str_join.h"
 #include "core/base/status.h"
 #include "core/nssm/safetensors.h"
 
@@ -12,7 +13,8 @@ using base::JsonFields;
 using nlohmann::json;
 
 constexpr char kMetadataKey[] = "metaekf";
-constexpr char kPosteriorName[] = "posterior.information";
+constexpr char kPosteriorName[] = "posterior.information", kCoordinatesName[] = "posterior.coordinates";
+constexpr char kAdaptedKey[] = "adapted";  // names of the tensors that the coordinates stand for
 constexpr char kPriorPrefix[] = "prior.";
 
 json ListOf(const Eigen::VectorXd& vector) { return std::vector<double>(vector.begin(), vector.end()); }
@@ -104,6 +106,7 @@ void ForEachPriorMatrix(Prior& prior, const Visit& visit) {
   visit("start", prior.start);
   visit("start_guess", prior.start_guess);
   visit("examples", prior.examples);
+  visit("loadings", prior.loadings);
 }
 
 void AppendPrior(const GaussianPrior& prior, Safetensors* file) {
@@ -155,11 +158,11 @@ Safetensors::Tensor TensorOf(const GaussianPosterior& posterior) {
   return tensor;
 }
 
-/// @param size  of the adapted parameters.
+/// @param size  of what it is of: the adapted parameters, or the coordinates.
 absl::StatusOr<GaussianPosterior> ReadPosterior(const Safetensors::Tensor& tensor, int64_t size) {
   if (static_cast<int64_t>(tensor.values.size()) != size * (size + 1) / 2) {
     return absl::InvalidArgumentError(absl::StrCat("tensor \"", tensor.name, "\" has ", tensor.values.size(), " elements, the triangle of ",
-                                                   size, " adapted parameters has ", size * (size + 1) / 2));
+                                                   size, " adapted numbers has ", size * (size + 1) / 2));
   }
   GaussianPosterior posterior;
   posterior.information.resize(size, size);
@@ -264,28 +267,70 @@ absl::StatusOr<Bundle> ReadModelFile(const std::string& bytes) {
 
 std::string WriteAdaptedSubset(const Bundle& bundle, const nn::Mask& mask) {
   Safetensors file;
+  const bool few = bundle.posterior && bundle.posterior->coordinates.size() > 0;
+  std::vector<std::string> names;
   for (size_t i = 0; i < mask.size(); ++i) {
-    if (mask[i]) file.tensors.push_back(TensorOf(bundle.model.layout().tensors()[i], bundle));
+    if (!mask[i]) continue;
+    names.push_back(bundle.model.layout().tensors()[i].name);
+    if (!few) file.tensors.push_back(TensorOf(bundle.model.layout().tensors()[i], bundle));
+  }
+  if (few) {
+    const Eigen::VectorXd& z = bundle.posterior->coordinates;
+    file.tensors.push_back({.name = kCoordinatesName, .shape = {z.size()}, .values = std::vector<double>(z.begin(), z.end())});
+    file.metadata[kAdaptedKey] = names.size() == mask.size() ? "*" : absl::StrJoin(names, ",");
   }
   if (bundle.posterior) file.tensors.push_back(TensorOf(*bundle.posterior));
   return WriteSafetensors(file);
 }
 
+namespace {
+
+/// ω₀ + V z into the adapted tensors. Errors: InvalidArgument if the base has no such directions.
+absl::Status MoveAlongLoadings(const Safetensors& file, const Safetensors::Tensor& coordinates, Bundle* bundle) {
+  const auto adapted = file.metadata.find(kAdaptedKey);
+  METAEKF_ASSIGN_OR_RETURN(const nn::Mask mask, nn::ParseMask(adapted == file.metadata.end() ? "*" : adapted->second, bundle->model.layout()));
+  std::vector<size_t> places;  // of the adapted parameters in ω
+  for (size_t i = 0; i < mask.size(); ++i) {
+    const nn::Tensor& tensor = bundle->model.layout().tensors()[i];
+    for (int64_t k = 0; mask[i] && k < tensor.size(); ++k) places.push_back(static_cast<size_t>(tensor.offset + k));
+  }
+  const Eigen::VectorXd z = Eigen::Map<const Eigen::VectorXd>(coordinates.values.data(), static_cast<Eigen::Index>(coordinates.values.size()));
+  if (!bundle->prior || bundle->prior->loadings.rows() != static_cast<Eigen::Index>(places.size()) || bundle->prior->loadings.cols() != z.size()) {
+    return absl::InvalidArgumentError(absl::StrCat("tensor \"", coordinates.name, "\": the model's prior has no ", z.size(),
+                                                   " directions of ", places.size(), " parameters"));
+  }
+  Eigen::VectorXd values(bundle->prior->loadings.rows());
+  for (size_t i = 0; i < places.size(); ++i) values[static_cast<Eigen::Index>(i)] = bundle->parameters[places[i]];
+  values = AlongLoadings(*bundle->prior, values, z);
+  for (size_t i = 0; i < places.size(); ++i) bundle->parameters[places[i]] = values[static_cast<Eigen::Index>(i)];
+  RoundToPrecision(bundle->model.spec().precision, &bundle->parameters);
+  return absl::OkStatus();
+}
+
+}  // namespace
+
 absl::Status ApplyAdaptedSubset(const std::string& bytes, Bundle* bundle) {
   METAEKF_ASSIGN_OR_RETURN(const Safetensors file, ReadSafetensors(bytes));
   nn::Mask seen(bundle->model.layout().tensors().size(), false);
   int64_t adapted = 0;
-  const Safetensors::Tensor* posterior = nullptr;
+  const Safetensors::Tensor *posterior = nullptr, *coordinates = nullptr;
   for (const Safetensors::Tensor& tensor : file.tensors) {
-    if (tensor.name == kPosteriorName) {
-      posterior = &tensor;
+    if (tensor.name == kPosteriorName || tensor.name == kCoordinatesName) {
+      (tensor.name == kPosteriorName ? posterior : coordinates) = &tensor;
       continue;
     }
     METAEKF_RETURN_IF_ERROR(StoreTensor(tensor, bundle, &seen));
     adapted += static_cast<int64_t>(tensor.values.size());
   }
+  if (coordinates != nullptr) {
+    METAEKF_RETURN_IF_ERROR(MoveAlongLoadings(file, *coordinates, bundle));
+    adapted = static_cast<int64_t>(coordinates->values.size());
+  }
   if (posterior == nullptr) return absl::OkStatus();
   METAEKF_ASSIGN_OR_RETURN(bundle->posterior, ReadPosterior(*posterior, adapted));
+  if (coordinates != nullptr) {
+    bundle->posterior->coordinates = Eigen::Map<const Eigen::VectorXd>(coordinates->values.data(), static_cast<Eigen::Index>(coordinates->values.size()));
+  }
   return absl::OkStatus();
 }
 

@@ -15,12 +15,19 @@ struct GaussianPrior {
   Eigen::VectorXd noise_variance;
   /// Fits of systems of the fleet, one a column: where the fit of a new one may start. Rows as those of `dynamics`.
   Eigen::MatrixXd examples;
+  /// V of a fleet whose systems differ along R directions alone, ω = ω₀ + V z with z ~ N(0, I), p × R; else empty.
+  Eigen::MatrixXd loadings;
 };
 
 /// What is known of the parameters of a system after its context (Laplace): ω ~ N(ω_MAP, information⁻¹). Units and order as
 /// those of GaussianPrior; an unknown start is integrated out.
 struct GaussianPosterior {
   Eigen::MatrixXd information;  ///< symmetric, positive definite
+  /// Under a prior with loadings: z, which the information is of then; ω is AlongLoadings. Else empty.
+  Eigen::VectorXd coordinates;
 };
+
+/// ω₀ + V z, of the adapted parameters.
+Eigen::VectorXd AlongLoadings(const GaussianPrior& prior, const Eigen::VectorXd& mean, const Eigen::VectorXd& coordinates);
 
 }  // namespace metaekf::nssm

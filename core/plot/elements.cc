@@ -48,6 +48,13 @@ void Text(double x, double y, const std::string& text, const std::string& attrib
                   Escaped(text), "</text>\n");
 }
 
+std::string BeginDocument(double width, double height) {
+  return absl::StrCat("<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"", Number(width), "\" height=\"", Number(height),
+                      "\" viewBox=\"0 0 ", Number(width), " ", Number(height),
+                      "\" font-family=\"DejaVu Sans, Helvetica, Arial, sans-serif\" font-size=\"12\">\n"
+                      "<style>text{fill:#222222}</style>\n<rect width=\"100%\" height=\"100%\" fill=\"white\"/>\n");
+}
+
 void Line(double x1, double y1, double x2, double y2, const char* colour, std::string& svg) {
   absl::StrAppend(&svg, "<path d=\"M", Number(x1), " ", Number(y1), "L", Number(x2), " ",
                   Number(y2), "\" stroke=\"", colour, "\"/>\n");

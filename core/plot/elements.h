@@ -6,6 +6,9 @@
 
 namespace metaekf::plot {
 
+/// The head of a document, white, with the font that all texts have; "</svg>" ends it.
+std::string BeginDocument(double width, double height);
+
 /// A coordinate with a tenth of a pixel, as short as it goes.
 std::string Number(double value);
 

@@ -71,11 +71,7 @@ absl::StatusOr<std::string> RenderSvg(const HeatMap& map) {
   left += 24;
   const double width = left + kCellWidthPx * static_cast<double>(columns) + kRightPx;
   const double bottom = kTopPx + kCellHeightPx * static_cast<double>(rows), height = bottom + kBottomPx;
-  std::string svg = absl::StrCat(
-      "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"", Number(width), "\" height=\"", Number(height), "\" viewBox=\"0 0 ",
-      Number(width), " ", Number(height),
-      "\" font-family=\"DejaVu Sans, Helvetica, Arial, sans-serif\" font-size=\"12\">\n<style>text{fill:#222222}</style>\n"
-      "<rect width=\"100%\" height=\"100%\" fill=\"white\"/>\n");
+  std::string svg = BeginDocument(width, height);
   Text(12, 24, map.title, " font-size=\"15\" font-weight=\"bold\"", svg);
   const Scale scale(map);
   for (Eigen::Index row = 0; row < rows; ++row) {

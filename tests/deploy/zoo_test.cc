@@ -1,6 +1,7 @@
 // The models that ship: each must load, and still do what deploy/zoo/README.md says of it.
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <filesystem>
 #include <fstream>
 #include <sstream>
@@ -77,6 +78,30 @@ TEST(ZooTest, BoucWenAdaptsToOnePeriod) {
   const BoucWenErrors errors = AdaptedBoucWen(8192);
   EXPECT_LE(errors.simulate, 3.5e-6);
   EXPECT_LE(errors.one_step, 3.5e-6);
+}
+
+/// Sum of squared errors of both states over 3,000 samples in free run, after adaptation to the first 400 noisy ones.
+double AdaptedVanDerPol(uint64_t seed) {
+  const auto bundle = nssm::ReadModelFile(Contents(kZoo + "/van-der-pol.safetensors"));
+  EXPECT_TRUE(bundle.ok()) << bundle.status();
+  const Trajectory noisy = Simulated("van-der-pol", seed, 3400, {{"noise_std", "0.005"}});
+  const Trajectory clean = Simulated("van-der-pol", seed, 3400, {});
+  nssm::Bundle adapted = *bundle;
+  const auto parameters =
+      meta::AdaptedParameters(*bundle, *data::FirstSamples(noisy, 400), *meta::DefaultAdaptation(*bundle));
+  EXPECT_TRUE(parameters.ok()) << parameters.status();
+  adapted.parameters = *parameters;
+  const Trajectory later = *data::SamplesFrom(clean, 399);
+  const Eigen::MatrixXd states = nssm::Predict(adapted, later, nssm::PredictionMode::kSimulate)->states;
+  return (states - later.states).rightCols(3000).squaredNorm();
+}
+
+// From noisy samples, where the best of the supervised and transferred models lies near 9,000 even without noise.
+TEST(ZooTest, VanDerPolAdaptsToFourHundredSamples) {
+  std::vector<double> errors;
+  for (uint64_t seed = 4242; seed < 4249; ++seed) errors.push_back(AdaptedVanDerPol(seed));
+  std::sort(errors.begin(), errors.end());
+  EXPECT_LT(errors[errors.size() / 2], 1000);
 }
 
 }  // namespace

@@ -33,7 +33,7 @@ TEST(ExecutorTest, SlotsAreNeverShared) {
 
 TEST(ExecutorTest, SerialRunsInOrder) {
   std::vector<size_t> order;
-  MakeSerialExecutor()->ParallelFor(4, [&](size_t index, size_t) { order.push_back(index); });
+  CallingThread()->ParallelFor(4, [&](size_t index, size_t) { order.push_back(index); });
   EXPECT_EQ(order, (std::vector<size_t>{0, 1, 2, 3}));
 }
 

@@ -6,5 +6,6 @@ metaekf_test(core/data/split_test.cc DEPS metaekf::core_data)
 
 metaekf_test(core/plot/axis_test.cc DEPS metaekf::core_plot)
 metaekf_test(core/plot/decimate_test.cc DEPS metaekf::core_plot)
+metaekf_test(core/plot/box_plot_test.cc DEPS metaekf::core_plot)
 metaekf_test(core/plot/heat_map_test.cc DEPS metaekf::core_plot)
 metaekf_test(core/plot/svg_test.cc DEPS metaekf::core_plot)

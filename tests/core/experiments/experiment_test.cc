@@ -74,9 +74,9 @@ TEST_P(EveryExperiment, WritesItsProtocolAndItsReport) {
 }
 
 TEST_P(EveryExperiment, StopsWhenTold) {
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   const absl::StatusOr<Report> report =
-      experiment().run({.budget = Budget::kTiny}, executor.get(), [](size_t, size_t, const std::string&) { return false; });
+      experiment().run({.budget = Budget::kTiny}, executor, [](size_t, size_t, const std::string&) { return false; });
   EXPECT_TRUE(absl::IsCancelled(report.status())) << report.status();
 }
 

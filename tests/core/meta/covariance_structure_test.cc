@@ -42,12 +42,12 @@ double LogLikelihood(const MatrixXd& covariance, const MatrixXd& second_moment) 
 
 TEST(CovarianceStructureTest, AFullOneIsTheSecondMoment) {
   const MatrixXd c = SecondMoment(1);
-  EXPECT_EQ(StructuredCovariance(Spec(PriorCovariance::kFull), kTensors, c), c);
+  EXPECT_EQ(FitStructure(Spec(PriorCovariance::kFull), kTensors, c).covariance, c);
 }
 
 TEST(CovarianceStructureTest, BlocksKeepEachTensorAndNothingBetweenTwo) {
   const MatrixXd c = SecondMoment(2);
-  const MatrixXd blocks = StructuredCovariance(Spec(PriorCovariance::kBlock), kTensors, c);
+  const MatrixXd blocks = FitStructure(Spec(PriorCovariance::kBlock), kTensors, c).covariance;
   const auto tensor_of = [](Index i) { return i < 3 ? 0 : i < 5 ? 1 : 2; };
   for (Index i = 0; i < kParameters; ++i) {
     for (Index j = 0; j < kParameters; ++j) EXPECT_EQ(blocks(i, j), tensor_of(i) == tensor_of(j) ? c(i, j) : 0);

@@ -118,6 +118,46 @@ TrainingSpec WithFactors(int32_t rank) {
   return spec;
 }
 
+TrainingSpec OnAManifold(int32_t rank) {
+  TrainingSpec spec = Spec();
+  spec.gaussian_prior.covariance = PriorCovariance::kManifold;
+  spec.gaussian_prior.rank = rank;
+  return spec;
+}
+
+// Frequency and damping are two numbers, and a few more directions straighten the curve that they draw among parameters.
+TEST(EmpiricalBayesTest, OnAManifoldASystemIsAFewNumbers) {
+  const nssm::Bundle bundle = *nssm::ReadModelFile(TrainedFile(2, nullptr, OnAManifold(4)));
+  ASSERT_LE(bundle.prior->loadings.cols(), 4);
+  double adapted_errors = 0, unadapted_errors = 0;
+  for (uint64_t seed = 100; seed < 105; ++seed) {
+    const Trajectory system = Resonators(1, 800, seed).trajectories[0];
+    const absl::StatusOr<AdaptationResult> result =
+        Adapt(bundle, *data::FirstSamples(system, 40), *DefaultAdaptation(bundle), nullptr);
+    ASSERT_TRUE(result.ok()) << result.status();
+    nssm::Bundle adapted = bundle;
+    adapted.parameters = result->parameters;
+    ASSERT_TRUE(result->posterior);
+    adapted.posterior.emplace(*result->posterior);
+    ASSERT_EQ(adapted.posterior->coordinates.size(), bundle.prior->loadings.cols());
+    EXPECT_EQ(adapted.posterior->information.rows(), bundle.prior->loadings.cols());
+    // What is stored is that and no more, and gives the same model bit for bit.
+    const std::string stored = nssm::WriteAdaptedSubset(adapted, result->mask);
+    EXPECT_LT(stored.size(), 700u);
+    nssm::Bundle restored = bundle;
+    ASSERT_TRUE(nssm::ApplyAdaptedSubset(stored, &restored).ok());
+    EXPECT_EQ(restored.parameters, adapted.parameters);
+    EXPECT_EQ(restored.posterior->coordinates, adapted.posterior->coordinates);
+    EXPECT_EQ(restored.posterior->information, adapted.posterior->information);
+    const auto error = [&](const nssm::Bundle& model) {
+      return nssm::ScorePredictions({system.outputs}, {nssm::Predict(model, system, nssm::PredictionMode::kSimulate)->outputs}).rmse[0];
+    };
+    adapted_errors += error(adapted);
+    unadapted_errors += error(bundle);
+  }
+  EXPECT_LT(adapted_errors, 0.2 * unadapted_errors);
+}
+
 TEST(EmpiricalBayesTest, APriorOfTwoFactorsIsOneAndIsAdaptedUnder) {
   const nssm::Bundle bundle = *nssm::ReadModelFile(TrainedFile(2, nullptr, WithFactors(2)));
   // Frequency and damping are two numbers: beside two factors each parameter has but a variance of its own.
@@ -143,9 +183,9 @@ TEST(EmpiricalBayesTest, APriorOfFactorsIsBitIdenticalWhateverTheThreadsAndResum
   const TrainingSpec spec = WithFactors(2);
   const std::string whole = TrainedFile(1, nullptr, spec);
   EXPECT_TRUE(TrainedFile(2, nullptr, spec) == whole);
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   std::string checkpoint;
-  const absl::Status status = Train(spec, Resonators(12, 300, 1), nullptr, executor.get(), [&](const TrainingProgress& p) {
+  const absl::Status status = Train(spec, Resonators(12, 300, 1), nullptr, executor, [&](const TrainingProgress& p) {
                                 checkpoint = WriteCheckpoint(p.state, "digest");
                                 return p.state.iteration < 20;
                               }).status();
@@ -155,8 +195,8 @@ TEST(EmpiricalBayesTest, APriorOfFactorsIsBitIdenticalWhateverTheThreadsAndResum
 }
 
 TEST(EmpiricalBayesTest, MoreFactorsThanParametersAreRefusedBeforeAnythingIsFitted) {
-  const auto executor = base::MakeSerialExecutor();
-  const absl::Status status = Train(WithFactors(1000), Resonators(12, 300, 1), nullptr, executor.get(), nullptr).status();
+  base::Executor* const executor = base::CallingThread();
+  const absl::Status status = Train(WithFactors(1000), Resonators(12, 300, 1), nullptr, executor, nullptr).status();
   EXPECT_EQ(status.code(), absl::StatusCode::kInvalidArgument);
   EXPECT_EQ(status.message().substr(0, 20), "gaussian_prior.rank:");
 }
@@ -181,9 +221,9 @@ TEST(EmpiricalBayesTest, OneRoundOnALinearFamilyIsItsClosedForm) {
   const nn::Mask mask = *nn::ParseMask("output_decoder", model.layout());
   Systems systems;
   for (uint64_t seed = 0; seed < 7; ++seed) systems.training.push_back(nssm::RandomTrajectory(spec.model, 60, 20 + seed));
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   TrainingState state;
-  const absl::StatusOr<LearnedPrior> learned = LearnGaussianPrior(spec, model, mask, systems, executor.get(), &state, nullptr);
+  const absl::StatusOr<LearnedPrior> learned = LearnGaussianPrior(spec, model, mask, systems, executor, &state, nullptr);
   ASSERT_TRUE(learned.ok()) << learned.status();
 
   const FitPlan plan(model, spec.loss, mask);
@@ -233,10 +273,10 @@ TEST(EmpiricalBayesTest, WhatDoesNotAdaptStaysAsInTheFirstFit) {
   const nssm::Model model = *nssm::Model::Create(spec.model);
   const nn::Mask mask = *nn::ParseMask("transition.*_bypass,output_decoder", model.layout());
   const Systems systems{.training = Resonators(4, 150, 1).trajectories};
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   TrainingState state;
   const absl::StatusOr<LearnedPrior> learned =
-      LearnGaussianPrior(spec, model, mask, systems, executor.get(), &state, nullptr);
+      LearnGaussianPrior(spec, model, mask, systems, executor, &state, nullptr);
   ASSERT_TRUE(learned.ok()) << learned.status();
   const GaussianPriorSpec& options = spec.gaussian_prior;
   const absl::StatusOr<SystemFit> first =
@@ -263,11 +303,11 @@ TEST(EmpiricalBayesTest, TheResultIsBitIdenticalWhateverTheNumberOfThreads) {
 }
 
 TEST(EmpiricalBayesTest, AResumedTrainingEqualsAnUninterruptedOne) {
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   const std::string whole = TrainedFile(1);
   for (const int32_t stop : {3, 11, 20, 33}) {  // after the first fit, inside of rounds, at the very end
     std::string checkpoint;
-    const absl::Status status = Train(Spec(), Resonators(12, 300, 1), nullptr, executor.get(), [&](const TrainingProgress& p) {
+    const absl::Status status = Train(Spec(), Resonators(12, 300, 1), nullptr, executor, [&](const TrainingProgress& p) {
                                   checkpoint = WriteCheckpoint(p.state, "digest");
                                   return p.state.iteration < stop;
                                 }).status();

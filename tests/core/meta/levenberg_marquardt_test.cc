@@ -83,7 +83,7 @@ TEST(LevenbergMarquardtTest, NeverAcceptsWhatIsWorseOrNotANumber) {
   });
   double last = std::numeric_limits<double>::infinity();
   const LevenbergMarquardtResult result = MinimiseLevenbergMarquardt(
-      objective, VectorXd::Constant(1, 4), {.max_iterations = 60, .tolerance = 1e-12}, [&](int, double cost) {
+      objective, VectorXd::Constant(1, 4), {.max_iterations = 60, .tolerance = 1e-12}, [&](int, double cost, const VectorXd&) {
         EXPECT_LT(cost, last);
         last = cost;
         return true;
@@ -97,7 +97,7 @@ TEST(LevenbergMarquardtTest, StopsWhenAskedWithTheBestSoFar) {
     return std::pair<VectorXd, MatrixXd>(x.array().exp().matrix(), MatrixXd(x.array().exp().matrix().asDiagonal()));
   });
   const LevenbergMarquardtResult result =
-      MinimiseLevenbergMarquardt(objective, VectorXd::Zero(2), {}, [](int iteration, double) { return iteration < 3; });
+      MinimiseLevenbergMarquardt(objective, VectorXd::Zero(2), {}, [](int iteration, double, const VectorXd&) { return iteration < 3; });
   EXPECT_TRUE(result.stopped);
   EXPECT_EQ(result.iterations, 3);
   EXPECT_LT(result.model.cost, 1);

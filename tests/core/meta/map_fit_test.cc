@@ -3,6 +3,7 @@
 #include <gtest/gtest.h>
 
 #include <Eigen/Cholesky>
+#include <Eigen/QR>
 
 #include "tests/core/nssm/random_models.h"
 
@@ -70,6 +71,44 @@ TEST(MapFitTest, ALinearModelsPosteriorIsBayesianLinearRegressions) {
   const MapFit fit = r.Fit();
   EXPECT_LT((fit.unknowns - mean).norm(), 1e-6 * mean.norm());
   EXPECT_LT((fit.information - information).norm(), 1e-10 * information.norm());
+}
+
+// θ = m + B z under z's share of the belief, Bᵀ Λ B: a regression on the columns of X B.
+TEST(MapFitTest, AlongDirectionsItIsTheRegressionOnThem) {
+  Regression r;
+  const Index n = r.problem->unknowns();
+  const MatrixXd directions = MatrixXd::Random(n, 3);
+  const VectorXd weights = r.belief.noise_variance.cwiseInverse().replicate(r.design.rows() / 2, 1);
+  const MatrixXd design = r.design * directions;
+  const MatrixXd information =
+      directions.transpose() * r.belief.precision * directions + design.transpose() * weights.asDiagonal() * design;
+  const VectorXd z = information.llt().solve(design.transpose() * weights.cwiseProduct(r.target - r.design * r.belief.mean));
+  const MapFit fit = r.Fit({.optimiser = {.max_iterations = 100, .tolerance = 1e-15}, .directions = directions});
+  EXPECT_LT((fit.coordinates - z).norm(), 1e-6 * z.norm());
+  EXPECT_LT((fit.unknowns - r.belief.mean - directions * z).norm(), 1e-6 * fit.unknowns.norm());
+  EXPECT_LT((fit.information - information).norm(), 1e-10 * information.norm());
+}
+
+TEST(MapFitTest, AlongAllDirectionsItIsTheFreeFit) {
+  Regression r;
+  const MatrixXd all = MatrixXd::Identity(r.problem->unknowns(), r.problem->unknowns());
+  const MapFitOptions options{.optimiser = {.max_iterations = 100, .tolerance = 1e-15}, .noise_samples = 5};
+  MapFitOptions along = options;
+  along.directions = all;
+  const MapFit free = r.Fit(options), restricted = r.Fit(along);
+  EXPECT_LT((free.unknowns - restricted.unknowns).norm(), 1e-9 * free.unknowns.norm());
+  EXPECT_LT((free.noise_variance - restricted.noise_variance).norm(), 1e-9);
+}
+
+TEST(MapFitTest, CoordinatesNearArePreciselyThoseOfWhatLiesOnTheDirections) {
+  Regression r;
+  const MatrixXd directions = MatrixXd::Random(r.problem->unknowns(), 3);
+  const VectorXd z = VectorXd::Random(3);
+  EXPECT_LT((CoordinatesNear(r.belief, directions, r.belief.mean + directions * z) - z).norm(), 1e-12);
+  // What is orthogonal to them in the belief's metric is not seen.
+  const MatrixXd weighted = r.belief.precision * directions;
+  const VectorXd orthogonal = weighted.householderQr().householderQ() * VectorXd::Unit(weighted.rows(), 3);
+  EXPECT_LT(CoordinatesNear(r.belief, directions, r.belief.mean + orthogonal).norm(), 1e-12);
 }
 
 TEST(MapFitTest, AnInfinitelySureBeliefStays) {

@@ -82,6 +82,27 @@ TEST(ScratchFitTest, StoppingEarlyPredictsBetterAfterAFewNoisySamples) {
   EXPECT_GT(gained / 5, std::log(1.5));
 }
 
+// Held out, a window of the model's own length would leave nothing to fit.
+TEST(ScratchFitTest, ARecordingTooShortToHoldAnythingOutIsFittedWhole) {
+  const auto fitted = [](bool stop_early) {
+    nssm::ModelSpec spec;
+    spec.input_size = spec.output_size = 1;
+    spec.state_size = 0;
+    spec.latent_size = 2;
+    spec.window = 6;
+    spec.precision = nssm::Precision::kFloat64;
+    const nssm::LossSpec loss{.horizon = 4, .stride = 1, .state_weight = 0, .reconstruction_weight = 0};
+    const nssm::Model model = *nssm::Model::Create(spec);
+    const FitPlan plan(model, loss, nn::Mask(model.layout().tensors().size(), true));
+    MatrixXd clean;
+    const absl::StatusOr<SystemFit> fit =
+        FitFromScratch(plan, model, loss, Resonator(12, 0.1, 1, &clean), {.seed = 1, .steps = 5, .stop_early = stop_early}, nullptr);
+    EXPECT_TRUE(fit.ok()) << fit.status();
+    return fit.ok() ? fit->parameters : std::vector<double>();
+  };
+  EXPECT_EQ(fitted(true), fitted(false));
+}
+
 // There is nothing to stop for: the fit goes on to the minimum of all samples, those that were held out too.
 TEST(ScratchFitTest, StoppingEarlyTakesNothingFromAnExactFit) {
   const Errors errors = ErrorsAfter(500, 1e-4, 1);

@@ -90,6 +90,8 @@ std::vector<Variant> Variants() {
     add(std::string("ImplicitMaml") + suffix, Algorithm::kImplicitMaml, optimiser, false);
   }
   add("FirstOrderMaml", Algorithm::kFirstOrderMaml, Optimiser::kGradientDescent, false);
+  add("MamlWithGrowingRollouts", Algorithm::kMaml, Optimiser::kGradientDescent, false);
+  variants.back().spec.horizon_growth_iterations = 10;
   add("MamlFromSeveralStarts", Algorithm::kMaml, Optimiser::kGradientDescent, false);
   variants.back().spec.restarts = 2;
   variants.back().spec.screening_iterations = 10;  // one of the stops below is the end of a start
@@ -116,10 +118,10 @@ TEST_P(EveryAlgorithmTest, IsBitIdenticalWhateverTheNumberOfThreads) {
 
 TEST_P(EveryAlgorithmTest, ResumedEqualsUninterrupted) {
   const TrainingSpec& spec = GetParam().spec;
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   for (const int32_t stop : {7, 10, 21}) {  // in the warm-up, at its end, behind it
     std::string checkpoint;
-    const absl::Status status = Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), [&](const TrainingProgress& p) {
+    const absl::Status status = Train(spec, Fleet(10, 80, 1), nullptr, executor, [&](const TrainingProgress& p) {
                                   if (p.state.iteration == stop) checkpoint = WriteCheckpoint(p.state, "digest");
                                   return p.state.iteration < stop;
                                 }).status();
@@ -137,9 +139,9 @@ struct Course {
 };
 
 Course CourseOf(const TrainingSpec& spec) {
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   Course course;
-  const absl::StatusOr<nssm::Bundle> bundle = Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), [&](const TrainingProgress& p) {
+  const absl::StatusOr<nssm::Bundle> bundle = Train(spec, Fleet(10, 80, 1), nullptr, executor, [&](const TrainingProgress& p) {
     EXPECT_LE(p.state.iteration, p.iterations);
     if (p.validated) course.losses[p.state.iteration] = p.state.validation_loss;
     return true;
@@ -196,9 +198,9 @@ TEST(RestartsTest, IfAllStartsDivergeTheTrainingHas) {
   spec.screening_iterations = 20;
   spec.warmup_iterations = 0;
   spec.outer_lr = spec.final_outer_lr = 1e3;
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   int32_t last = 0;
-  const absl::Status status = Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), [&](const TrainingProgress& p) {
+  const absl::Status status = Train(spec, Fleet(10, 80, 1), nullptr, executor, [&](const TrainingProgress& p) {
                                 last = p.state.iteration;
                                 return true;
                               }).status();
@@ -223,8 +225,8 @@ TEST(TrainTest, LearnedRatesGoIntoTheModelFileAndAreAdaptedWith) {
   TrainingSpec spec = SmallSpec();
   spec.inner_loop.learned_rates = spec.adaptation.learned_rates = true;
   spec.iterations = 60;
-  const auto executor = base::MakeSerialExecutor();
-  const absl::StatusOr<nssm::Bundle> trained = Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), nullptr);
+  base::Executor* const executor = base::CallingThread();
+  const absl::StatusOr<nssm::Bundle> trained = Train(spec, Fleet(10, 80, 1), nullptr, executor, nullptr);
   ASSERT_TRUE(trained.ok()) << trained.status();
   const nssm::Bundle bundle = *nssm::ReadModelFile(nssm::WriteModelFile(*trained));
   const AdaptationOptions options = *DefaultAdaptation(bundle);
@@ -256,7 +258,7 @@ TEST(TrainTest, CurvatureRatesBeginAtTheScaleOfTheLoss) {
     spec.loss.reconstruction_weight = 0;
     spec.warmup_iterations = 0;
     spec.iterations = 1;
-    const nssm::Bundle bundle = *Train(spec, Fleet(10, 80, 1), nullptr, base::MakeSerialExecutor().get(), nullptr);
+    const nssm::Bundle bundle = *Train(spec, Fleet(10, 80, 1), nullptr, base::CallingThread(), nullptr);
     // What is kept are the rates themselves, not what they began as.
     EXPECT_FALSE(ReadTrainingSpec(bundle.training)->inner_loop.curvature_rates);
     return DefaultAdaptation(bundle)->inner_loop.tensor_rates;
@@ -265,6 +267,47 @@ TEST(TrainTest, CurvatureRatesBeginAtTheScaleOfTheLoss) {
   ASSERT_EQ(of_one.size(), 4u);
   for (const auto& [name, rate] : of_one) {
     EXPECT_NEAR(of_hundred.at(name) * 100 / rate, 1, 0.05) << name;  // one outer step of a hundredth on their logarithms
+  }
+}
+
+/// Parameters after so many iterations.
+std::vector<double> ParametersAfter(const TrainingSpec& spec, int32_t iterations) {
+  std::vector<double> parameters;
+  EXPECT_FALSE(Train(spec, Fleet(10, 80, 1), nullptr, base::CallingThread(), [&](const TrainingProgress& p) {
+                 parameters = p.state.values.at("parameters");
+                 return p.state.iteration < iterations;
+               }).ok());
+  return parameters;
+}
+
+TEST(TrainTest, RolloutsGrowByDoubling) {
+  TrainingSpec growing = SmallSpec();
+  growing.warmup_horizon = 2;
+  growing.loss.horizon = 8;
+  growing.horizon_growth_iterations = 10;  // of length 2 up to iteration 15, of 4 up to 20, then of 8
+  const auto with_horizon = [&](int32_t horizon) {
+    TrainingSpec constant = growing;
+    constant.loss.horizon = horizon;
+    constant.horizon_growth_iterations = 0;
+    return constant;
+  };
+  EXPECT_EQ(ParametersAfter(growing, 15), ParametersAfter(with_horizon(2), 15));
+  EXPECT_NE(ParametersAfter(growing, 16), ParametersAfter(with_horizon(2), 16));
+  EXPECT_NE(ParametersAfter(growing, 16), ParametersAfter(with_horizon(8), 16));
+  // The step at which the last length begins is that of a training resumed there with constant length.
+  const auto state_after = [](const TrainingSpec& spec, const TrainingState* resume, int32_t iterations) {
+    TrainingState state;
+    EXPECT_FALSE(Train(spec, Fleet(10, 80, 1), resume, base::CallingThread(), [&](const TrainingProgress& p) {
+                   state = p.state;
+                   return p.state.iteration < iterations;
+                 }).ok());
+    return state;
+  };
+  for (const auto& [iteration, horizon] : {std::pair{16, 4}, {19, 4}, {20, 8}, {25, 8}}) {
+    const TrainingState before = state_after(growing, nullptr, iteration);
+    EXPECT_EQ(state_after(growing, &before, iteration + 1).values.at("parameters"),
+              state_after(with_horizon(horizon), &before, iteration + 1).values.at("parameters"))
+        << iteration;
   }
 }
 
@@ -294,8 +337,8 @@ TEST(TrainTest, ContextsAtTheStartAreTheFirstSamples) {
 TEST(TrainTest, AModelOfImplicitMamlIsPulledToItsStartAtAdaptationToo) {
   TrainingSpec spec = SmallSpec();
   spec.algorithm = Algorithm::kImplicitMaml;
-  const auto executor = base::MakeSerialExecutor();
-  const nssm::Bundle bundle = *Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), nullptr);
+  base::Executor* const executor = base::CallingThread();
+  const nssm::Bundle bundle = *Train(spec, Fleet(10, 80, 1), nullptr, executor, nullptr);
   const Trajectory system = Fleet(1, 60, 3).trajectories[0];
   AdaptationOptions options = *DefaultAdaptation(bundle);
   const auto distance = [&](double proximal) {
@@ -316,8 +359,8 @@ TEST(TrainTest, AModelOfImplicitMamlByLevenbergMarquardtAdaptsToTheMinimumItWasT
   spec.inner_loop = spec.adaptation = {
       .steps = 30, .adapted_mask = "transition", .optimiser = Optimiser::kLevenbergMarquardt, .proximal = 0.3};
   spec.loss.reconstruction_weight = 0;
-  const auto executor = base::MakeSerialExecutor();
-  const nssm::Bundle bundle = *Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), nullptr);
+  base::Executor* const executor = base::CallingThread();
+  const nssm::Bundle bundle = *Train(spec, Fleet(10, 80, 1), nullptr, executor, nullptr);
   const Trajectory system = Fleet(1, 60, 3).trajectories[0];
   const AdaptationOptions options = *DefaultAdaptation(bundle);
   EXPECT_EQ(options.method, AdaptationMethod::kLevenbergMarquardt);
@@ -346,7 +389,7 @@ TEST(TrainTest, ATrainingThatDivergesSaysSoAndLeavesItsLastGoodState) {
   spec.warmup_iterations = 0;
   spec.iterations = 200;
   spec.outer_lr = spec.final_outer_lr = 1e3;
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   std::string checkpoint;
   bool diverged = false;
   const auto on_step = [&](const TrainingProgress& p) {
@@ -355,7 +398,7 @@ TEST(TrainTest, ATrainingThatDivergesSaysSoAndLeavesItsLastGoodState) {
     checkpoint = WriteCheckpoint(p.state, "digest");
     return true;
   };
-  const absl::Status status = Train(spec, Fleet(10, 80, 1), nullptr, executor.get(), on_step).status();
+  const absl::Status status = Train(spec, Fleet(10, 80, 1), nullptr, executor, on_step).status();
   ASSERT_EQ(status.code(), absl::StatusCode::kOutOfRange) << status;
   EXPECT_TRUE(diverged);
   for (const char* part : {"diverged at iteration", "loss", "gradient norm", "last good state", "outer_lr (now 1000)"}) {
@@ -367,7 +410,7 @@ TEST(TrainTest, ATrainingThatDivergesSaysSoAndLeavesItsLastGoodState) {
     EXPECT_TRUE(std::all_of(values.begin(), values.end(), [](double value) { return std::isfinite(value); })) << name;
   }
   // Good: a loss is still a number there, so the training goes on from it, to the same end.
-  const absl::Status again = Train(spec, Fleet(10, 80, 1), &*state, executor.get(), nullptr).status();
+  const absl::Status again = Train(spec, Fleet(10, 80, 1), &*state, executor, nullptr).status();
   EXPECT_EQ(again, status);
 }
 
@@ -399,9 +442,9 @@ TEST(TrainTest, AdaptingToAnUnseenSystemBeatsTheMetaLearnedModel) {
 }
 
 TEST(TrainTest, WhatDoesNotFitIsRefusedByName) {
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   const auto message = [&](const TrainingSpec& spec, const Dataset& fleet) {
-    return std::string(Train(spec, fleet, nullptr, executor.get(), nullptr).status().message());
+    return std::string(Train(spec, fleet, nullptr, executor, nullptr).status().message());
   };
   Dataset fleet = Fleet(5, 80, 1);
   TrainingSpec spec = SmallSpec();
@@ -424,8 +467,8 @@ TEST(TrainTest, WhatDoesNotFitIsRefusedByName) {
 }
 
 TEST(AdaptTest, AContextTooShortIsRefusedWithTheNumberNeeded) {
-  const auto executor = base::MakeSerialExecutor();
-  const nssm::Bundle bundle = *Train(SmallSpec(), Fleet(10, 80, 1), nullptr, executor.get(), nullptr);
+  base::Executor* const executor = base::CallingThread();
+  const nssm::Bundle bundle = *Train(SmallSpec(), Fleet(10, 80, 1), nullptr, executor, nullptr);
   const Trajectory system = Fleet(1, 7, 3).trajectories[0];
   const absl::Status status = Adapt(bundle, system, {.inner_loop = {.steps = 1}}, nullptr).status();
   EXPECT_EQ(status.code(), absl::StatusCode::kFailedPrecondition);
@@ -437,8 +480,8 @@ TEST(AdaptTest, AContextTooShortIsRefusedWithTheNumberNeeded) {
 }
 
 TEST(AdaptTest, ZeroStepsLeaveTheModelAndFullyFrozenTensorsStay) {
-  const auto executor = base::MakeSerialExecutor();
-  const nssm::Bundle bundle = *Train(SmallSpec(), Fleet(10, 80, 1), nullptr, executor.get(), nullptr);
+  base::Executor* const executor = base::CallingThread();
+  const nssm::Bundle bundle = *Train(SmallSpec(), Fleet(10, 80, 1), nullptr, executor, nullptr);
   const Trajectory system = Fleet(1, 60, 3).trajectories[0];
   EXPECT_EQ(Adapt(bundle, system, {.inner_loop = {.steps = 0}}, nullptr)->parameters, bundle.parameters);
   const AdaptationResult result =

@@ -47,7 +47,7 @@ TEST(TrainingSpecTest, ImplicitMamlTakesLevenbergMarquardtAndSoDoesItsAdaptation
 }
 
 TEST(TrainingSpecTest, EveryStructureOfAPriorsCovarianceIsReadAndWritten) {
-  for (const auto& [name, rank] : {std::pair{"FULL", 0}, {"LOW_RANK", 3}, {"BLOCK", 0}}) {
+  for (const auto& [name, rank] : {std::pair{"FULL", 0}, {"LOW_RANK", 3}, {"BLOCK", 0}, {"MANIFOLD", 2}}) {
     const auto spec = ReadTrainingSpec(WithModel({{"gaussian_prior", {{"covariance", name}, {"rank", rank}}}}));
     ASSERT_TRUE(spec.ok()) << spec.status();
     EXPECT_EQ(spec->gaussian_prior.rank, rank);
@@ -89,6 +89,11 @@ TEST(TrainingSpecTest, WhatAnAlgorithmCannotUseIsRefusedByName) {
   expect_refused({{"inner_loop", {{"tensor_rates", {{"a", -1}}}}}}, "inner_loop.tensor_rates.a");
   expect_refused({{"inner_loop", {{"tensor_rates", 3}}}}, "inner_loop.tensor_rates");
   expect_refused({{"implicit_maml", {{"cg_tolerance", 2}}}}, "implicit_maml.cg_tolerance");
+  expect_refused({{"iterations", 100}, {"warmup_iterations", 60}, {"horizon_growth_iterations", 40}}, "horizon_growth_iterations");
+  expect_refused({{"algorithm", "GAUSSIAN_PRIOR"}, {"horizon_growth_iterations", 10}}, "horizon_growth_iterations");
+  const json by_curvature = {{"curvature_rates", true}, {"learned_rates", true}};
+  expect_refused({{"inner_loop", by_curvature}, {"restarts", 2}, {"screening_iterations", 10}, {"warmup_iterations", 10}},
+                 "screening_iterations");
   expect_refused({{"restarts", 2}}, "screening_iterations");
   expect_refused({{"restarts", 2}, {"screening_iterations", 101}, {"iterations", 100}}, "screening_iterations");
   expect_refused({{"restarts", 2}, {"screening_iterations", 10}, {"validation_share", 0}}, "validation_share");
@@ -96,6 +101,7 @@ TEST(TrainingSpecTest, WhatAnAlgorithmCannotUseIsRefusedByName) {
   expect_refused({{"gaussian_prior", {{"rank", 2}}}}, "gaussian_prior.rank");
   expect_refused({{"gaussian_prior", {{"covariance", "BLOCK"}, {"rank", 2}}}}, "gaussian_prior.rank");
   expect_refused({{"gaussian_prior", {{"covariance", "LOW_RANK"}}}}, "gaussian_prior.rank");
+  expect_refused({{"gaussian_prior", {{"covariance", "MANIFOLD"}}}}, "gaussian_prior.rank");
   expect_refused({{"gaussian_prior", {{"covariance", "DIAGONAL"}}}}, "gaussian_prior.covariance");
 }
 

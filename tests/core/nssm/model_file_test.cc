@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cstring>
 
 #include "core/nssm/safetensors.h"
@@ -71,6 +72,35 @@ TEST(ModelFileTest, APosteriorGoesWithTheAdaptedSubset) {
   file.tensors.back().shape[0] += 1;
   const absl::Status refused = ApplyAdaptedSubset(WriteSafetensors(file), &restored);
   EXPECT_NE(std::string(refused.message()).find("posterior.information"), std::string::npos) << refused;
+}
+
+TEST(ModelFileTest, CoordinatesNeedTheDirectionsOfTheirBase) {
+  Bundle base = SomeBundle(ModelCases().front());
+  const nn::Mask mask = *nn::ParseMask("output_decoder.0.bias", base.model.layout());
+  const Eigen::Index p = base.model.spec().output_size;
+  base.prior.emplace();
+  base.prior->loadings = Eigen::MatrixXd::Random(p, 1);
+  Bundle adapted = base;
+  adapted.posterior.emplace(GaussianPosterior{Eigen::MatrixXd::Identity(1, 1), Eigen::VectorXd::Constant(1, 0.5)});
+  const std::string subset = WriteAdaptedSubset(adapted, mask);
+  Bundle restored = base;
+  ASSERT_TRUE(ApplyAdaptedSubset(subset, &restored).ok());
+  const auto bias = std::find_if(base.model.layout().tensors().begin(), base.model.layout().tensors().end(),
+                                 [](const nn::Tensor& tensor) { return tensor.name == "output_decoder.0.bias"; });
+  for (Eigen::Index i = 0; i < p; ++i) {
+    const size_t place = static_cast<size_t>(bias->offset + i);
+    const double moved = base.parameters[place] + 0.5 * base.prior->loadings(i, 0);
+    EXPECT_NEAR(restored.parameters[place], moved, 1e-6);  // the model's own precision is single
+    restored.parameters[place] = base.parameters[place];
+  }
+  EXPECT_EQ(restored.parameters, base.parameters);
+  Bundle other = base;
+  other.prior->loadings = Eigen::MatrixXd::Random(p, 2);
+  for (Bundle* wrong : {&other, &restored}) {
+    if (wrong == &restored) wrong->prior.reset();
+    const absl::Status refused = ApplyAdaptedSubset(subset, wrong);
+    EXPECT_NE(std::string(refused.message()).find("posterior.coordinates"), std::string::npos) << refused;
+  }
 }
 
 TEST(ModelFileTest, WhatIsMissingOrDamagedIsNamed) {

@@ -22,7 +22,7 @@ const Eigen::Vector3d kRest = Eigen::Vector3d::Zero();
 
 absl::StatusOr<Fleet> SimulateWith(Request request) {
   request.system = "bouc-wen";
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   return Simulate(request, *executor);
 }
 

@@ -11,7 +11,7 @@ namespace {
 using ::testing::HasSubstr;
 
 absl::StatusOr<Fleet> Simulated(const Request& request) {
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   return Simulate(request, *executor);
 }
 

@@ -15,7 +15,7 @@ using ::testing::HasSubstr;
 absl::StatusOr<Fleet> SimulateWith(const std::map<std::string, std::string>& settings,
                                    std::optional<int64_t> steps = std::nullopt,
                                    int64_t systems = 1) {
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   return Simulate({.system = "van-der-pol",
                    .systems = systems,
                    .seed = 3,
@@ -83,7 +83,7 @@ TEST(VanDerPolTest, RefusesWhatItCannotSimulate) {
   EXPECT_THAT(std::string(diverging.status().message()),
               HasSubstr("system 0: the simulation diverges"));
 
-  const auto executor = base::MakeSerialExecutor();
+  base::Executor* const executor = base::CallingThread();
   const auto with_input = Simulate(
       {.system = "van-der-pol", .input = RecordedInput{Eigen::MatrixXd::Zero(1, 9)}}, *executor);
   EXPECT_THAT(std::string(with_input.status().message()), HasSubstr("van-der-pol takes no input"));

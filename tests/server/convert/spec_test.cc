@@ -73,6 +73,7 @@ v1::TrainingSpec FullSpec() {
   spec.mutable_inner_loop()->set_optimiser(v1::InnerLoopSpec::GRADIENT_DESCENT);  // whose curvature_rates
   spec.set_algorithm(v1::TrainingSpec::FIRST_ORDER_MAML);             // the last learns no rates
   model.set_start(v1::ModelSpec::ENCODED);  // FITTED is Case I's
+  spec.set_iterations(spec.warmup_iterations() + spec.horizon_growth_iterations() + 1);  // at least
   spec.set_screening_iterations(spec.iterations());  // at most
   // Read as the whole set, which has no number.
   spec.mutable_loss()->clear_horizon();
