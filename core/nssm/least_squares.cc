@@ -165,7 +165,7 @@ absl::StatusOr<LossData<double>> RolloutLeastSquares::Cut(const data::Trajectory
 }
 
 RolloutLeastSquares::Workspace::Workspace(const RolloutLeastSquares& owner, const LossShape& shape)
-    : shape_(shape), width_(std::min(shape.rollouts, kColumns)), steps_(std::min(shape.horizon, std::max(1, kColumns / width_))) {
+    : width_(std::min(shape.rollouts, kColumns)), steps_(std::min(shape.horizon, std::max(1, kColumns / width_))) {
   const Model& model = owner.model_;
   const ModelSpec& spec = model.spec();
   const int32_t n = owner.carry_size_, columns = width_ * steps_;
@@ -238,8 +238,7 @@ RolloutLeastSquares::Workspace::Workspace(const RolloutLeastSquares& owner, cons
   factors_.setZero(n);
   const int64_t residuals = int64_t{shape.rollouts} * shape.horizon * owner.channels_;
   holds_all_ = unknowns * residuals <= kMostKept;
-  rows_.setZero(unknowns, holds_all_ ? residuals : std::max<int64_t>(kPanel, owner.channels_));
-  residuals_.setZero(rows_.cols());
+  kept_rows_ = holds_all_ ? residuals : std::max<int64_t>(kPanel, owner.channels_);
 }
 
 void RolloutLeastSquares::Encode(const double* parameters, const LossData<double>& data, int32_t first, int32_t count,
@@ -354,6 +353,10 @@ void RolloutLeastSquares::Linearise(const double* parameters, const VectorXd& st
     PropagateSensitivity(static_cast<size_t>(all), static_cast<size_t>(carries), sensitivity, w.factors_.data(), terms.data(),
                          terms.size(), static_cast<size_t>(column), scale, target);
   };
+  if (w.rows_.size() == 0) {
+    w.rows_.setZero(all, w.kept_rows_);
+    w.residuals_.setZero(w.kept_rows_);
+  }
   int64_t rows = 0, squared = 0;
   const auto square = [&] {
     cblas_dsyrk(CblasColMajor, CblasLower, CblasNoTrans, all, static_cast<int>(rows - squared), 1, w.rows_.col(squared).data(),

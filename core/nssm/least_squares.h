@@ -54,7 +54,6 @@ class RolloutLeastSquares {
       autodiff::Executable<double> executable;
       autodiff::Arena<double> arena;
     };
-    LossShape shape_;
     int32_t width_;  // rollouts side by side
     int32_t steps_;  // steps at a time
     std::optional<Compiled> encode_, rollout_, local_;
@@ -65,7 +64,8 @@ class RolloutLeastSquares {
     std::vector<std::vector<DirectTerm>> terms_, start_terms_;  // of every component, pointing there
     Eigen::MatrixXd sensitivity_, next_sensitivity_;  // S of every rollout side by side, unknowns × n each
     Eigen::VectorXd factors_;                         // of one component by the carry
-    Eigen::MatrixXd rows_;       // weighted rows of J, as columns: all of them, or as many as are squared at a time
+    Eigen::MatrixXd rows_;       // weighted rows of J, as columns; made by the first linearisation, for costs do without
+    int64_t kept_rows_;          // of them: all, or as many as are squared at a time
     Eigen::VectorXd residuals_;  // weighted, beside them
     bool holds_all_ = false;
   };

@@ -3,12 +3,10 @@
 #include <gtest/gtest.h>
 
 #include <Eigen/Eigenvalues>
-#include <Eigen/Geometry>
 #include <Eigen/LU>
 #include <algorithm>
 #include <cmath>
 
-#include "core/base/rng.h"
 #include "core/data/split.h"
 #include "core/meta/adapt.h"
 #include "core/meta/arx.h"
@@ -17,6 +15,7 @@
 #include "core/meta/train.h"
 #include "core/nssm/model_file.h"
 #include "core/nssm/predict.h"
+#include "tests/core/meta/resonators.h"
 #include "tests/core/nssm/random_models.h"
 
 namespace metaekf::meta {
@@ -30,29 +29,7 @@ using Eigen::VectorXd;
 
 constexpr double kNoise = 0.02;
 
-/// Damped resonators of unknown frequency and damping, x measured only through y = x₁ + noise.
-Dataset Resonators(size_t systems, int64_t length, uint64_t seed) {
-  Dataset fleet{.input_names = {"u1"}, .output_names = {"y1"}};
-  for (size_t s = 0; s < systems; ++s) {
-    base::Rng rng(seed, s);
-    const double angle = rng.Uniform(0.3, 0.5), radius = rng.Uniform(0.9, 0.95);
-    Trajectory t{.name = std::to_string(s), .sample_period_s = 0.1};
-    t.inputs.resize(1, length);
-    t.outputs.resize(1, length);
-    t.states.resize(0, length);
-    Eigen::Vector2d x = Eigen::Vector2d::Zero();
-    for (Index k = 0; k < length; ++k) {
-      t.inputs(0, k) = rng.Normal();
-      const Eigen::Rotation2D<double> rotation(angle);
-      x = radius * (rotation * x);
-      x[0] += t.inputs(0, k);
-      x[1] -= 0.2 * std::tanh(x[0]);
-      t.outputs(0, k) = x[0] + kNoise * rng.Normal();
-    }
-    fleet.trajectories.push_back(std::move(t));
-  }
-  return fleet;
-}
+Dataset Resonators(size_t systems, int64_t length, uint64_t seed) { return ResonatorFleet(systems, length, kNoise, seed); }
 
 TrainingSpec Spec() {
   TrainingSpec spec;

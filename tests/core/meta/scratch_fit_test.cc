@@ -2,11 +2,10 @@
 
 #include <gtest/gtest.h>
 
-#include <Eigen/Geometry>
 #include <cmath>
 
-#include "core/base/rng.h"
 #include "core/data/split.h"
+#include "tests/core/meta/resonators.h"
 
 namespace metaekf::meta {
 namespace {
@@ -16,28 +15,6 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 
 constexpr int64_t kFuture = 300;  // samples after the context
-
-/// A damped resonator, bent a little. @param clean  its outputs without noise.
-Trajectory Resonator(int64_t length, double noise, uint64_t seed, MatrixXd* clean) {
-  base::Rng rng(seed), of_noise(seed, 1);
-  const double angle = rng.Uniform(0.3, 0.5), radius = rng.Uniform(0.9, 0.95);
-  Trajectory t{.name = "resonator", .sample_period_s = 0.1};
-  t.inputs.resize(1, length);
-  t.outputs.resize(1, length);
-  t.states.resize(0, length);
-  Eigen::Vector2d x = Eigen::Vector2d::Zero();
-  for (Index k = 0; k < length; ++k) {
-    t.inputs(0, k) = rng.Normal();
-    const Eigen::Rotation2D<double> rotation(angle);
-    x = radius * (rotation * x);
-    x[0] += t.inputs(0, k);
-    x[1] -= 0.2 * std::tanh(x[0]);
-    t.outputs(0, k) = x[0];
-  }
-  *clean = t.outputs;
-  for (Index k = 0; k < length; ++k) t.outputs(0, k) += noise * of_noise.Normal();
-  return t;
-}
 
 struct Errors {
   double to_minimum, stopped_early;

@@ -9,6 +9,7 @@
 
 #include "core/meta/adapt.h"
 #include "core/base/rng.h"
+#include "core/data/split.h"
 #include "core/nssm/model_file.h"
 
 namespace metaekf::meta {
@@ -464,6 +465,31 @@ TEST(TrainTest, WhatDoesNotFitIsRefusedByName) {
   EXPECT_NE(message(SmallSpec(), fleet).find("trajectory 3"), std::string::npos);
   fleet.state_names.clear();
   EXPECT_NE(message(SmallSpec(), fleet).find("state columns"), std::string::npos);
+}
+
+// A network of hundreds of parameters learns the noise of 40 samples by heart, if it is let: from scratch it stops where it
+// simulates the tail best, and the whole context gets as many steps.
+TEST(AdaptTest, GradientStepsFromScratchStopWhereTheTailIsSimulatedBest) {
+  TrainingSpec spec = SmallSpec();
+  spec.model.transition.block.hidden_widths = {40};
+  const nssm::Bundle bundle = *Train(spec, Fleet(10, 80, 1), nullptr, base::CallingThread(), nullptr);
+  Trajectory system = Fleet(1, 40, 3).trajectories[0];
+  base::Rng rng(1);
+  for (Eigen::Index t = 0; t < system.length(); ++t) system.states(0, t) += 0.3 * rng.Normal();
+  system.outputs = system.states;
+  const AdaptationOptions options{.method = AdaptationMethod::kFromScratch, .inner_loop = {.steps = 3000, .learning_rate = 3e-3}, .seed = 1};
+  const AdaptationResult stopped = *Adapt(bundle, system, options, nullptr);
+  EXPECT_LT(stopped.steps, options.inner_loop.steps);
+  EXPECT_GT(stopped.steps, 0);
+  AdaptationOptions as_many = options;
+  as_many.inner_loop.steps = stopped.steps;
+  EXPECT_EQ(*AdaptedParameters(bundle, system, as_many), stopped.parameters);
+  // The end of the trial is no better on the tail than where it stopped: it is the trial of so many steps that tells its errors.
+  nssm::Bundle to_the_end = bundle;
+  to_the_end.parameters = *AdaptedParameters(bundle, *data::FirstSamples(system, system.length() - stopped.tail_samples), options);
+  const Trajectory tail = *data::SamplesFrom(system, system.length() - stopped.tail_samples);
+  const auto simulated = nssm::Predict(to_the_end, tail, nssm::PredictionMode::kSimulate);
+  EXPECT_GT(nssm::ScorePredictions({tail.outputs}, {simulated->outputs}).rmse[0], stopped.after.simulate[0]);
 }
 
 TEST(AdaptTest, AContextTooShortIsRefusedWithTheNumberNeeded) {
