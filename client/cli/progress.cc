@@ -32,19 +32,19 @@ Progress::~Progress() {
 void Progress::Update(uint64_t done, uint64_t total, std::optional<double> time_left_s,
                       const std::string& text) {
   const Clock::time_point now = Clock::now();
-  if (!pace_from_) pace_from_ = {now, done};
-  const bool first = console_.err_is_terminal && !drawn_;
-  if (!first && now - last_ < (console_.err_is_terminal ? Clock::duration(kRedraw)
+  const bool other_work = pace_from_ && pace_from_->total != total;
+  if (!pace_from_ || other_work) pace_from_ = {now, done, total};
+  const bool at_once = other_work || (console_.err_is_terminal && !drawn_);
+  if (!at_once && now - last_ < (console_.err_is_terminal ? Clock::duration(kRedraw)
                                                         : Clock::duration(kPlainLine))) {
     return;
   }
   last_ = now;
   const double share =
       total > 0 ? std::min(1.0, static_cast<double>(done) / static_cast<double>(total)) : 0;
-  const auto& [since, done_then] = *pace_from_;
-  if (!time_left_s && done > done_then && total >= done) {
-    const double elapsed_s = std::chrono::duration<double>(now - since).count();
-    time_left_s = elapsed_s * static_cast<double>(total - done) / static_cast<double>(done - done_then);
+  if (!time_left_s && done > pace_from_->done && total >= done) {
+    const double elapsed_s = std::chrono::duration<double>(now - pace_from_->at).count();
+    time_left_s = elapsed_s * static_cast<double>(total - done) / static_cast<double>(done - pace_from_->done);
   }
   std::string line = absl::StrCat(done, "/", total);
   if (time_left_s) absl::StrAppend(&line, ", ", FormatDuration(*time_left_s), " left");

@@ -28,8 +28,12 @@ class Progress {
   Console& console_;
   std::string label_;
   Clock::time_point last_ = Clock::now();
-  /// The first report, and what was done by then: what came before it may have been other work.
-  std::optional<std::pair<Clock::time_point, uint64_t>> pace_from_;
+  /// The first report of so many pieces in all, and what was done by then: what came before it may have been other work.
+  struct Begin {
+    Clock::time_point at;
+    uint64_t done, total;
+  };
+  std::optional<Begin> pace_from_;
   bool drawn_ = false;
 };
 

@@ -137,12 +137,17 @@ absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learn
   using Clock = std::chrono::steady_clock;
   std::vector<Training> trainings;
   for (const Learner& learner : learners) {
-    if (on_progress && !on_progress(trainings.size(), learners.size(), "training " + learner.label)) {
-      return absl::CancelledError("the study was cancelled");
-    }
+    const auto tell = [&](int32_t iteration, int32_t iterations) {
+      const std::string what = absl::StrCat("training ", learner.label, ", ", 100 * int64_t{iteration} / iterations, " %");
+      return !on_progress || on_progress(trainings.size(), learners.size(), what);
+    };
+    if (!tell(0, 1)) return absl::CancelledError("the study was cancelled");
     const PeakMemory memory;
     const Clock::time_point begin = Clock::now();
-    METAEKF_ASSIGN_OR_RETURN(nssm::Bundle bundle, TrainLearner(learner, fleet, context, seed, executor));
+    METAEKF_ASSIGN_OR_RETURN(nssm::Bundle bundle,
+                             TrainLearner(learner, fleet, context, seed, executor, [&tell](const meta::TrainingProgress& step) {
+                               return tell(step.state.iteration, step.iterations);
+                             }));
     const double seconds = std::chrono::duration<double>(Clock::now() - begin).count();
     trainings.push_back({std::move(bundle), seconds, memory.MiB()});
   }

@@ -7,7 +7,6 @@
 #include "core/base/status.h"
 #include "core/data/split.h"
 #include "core/meta/adapt.h"
-#include "core/meta/train.h"
 
 namespace metaekf::experiments {
 namespace {
@@ -49,7 +48,7 @@ absl::Status CheckLearner(const Learner& learner) {
 }
 
 absl::StatusOr<nssm::Bundle> TrainLearner(const Learner& learner, const data::Dataset& fleet, const Trajectory& context,
-                                          uint64_t seed, base::Executor* executor) {
+                                          uint64_t seed, base::Executor* executor, const meta::OnTrainingStep& on_step) {
   nlohmann::json specification = learner.specification;
   specification["seed"] = seed;
   METAEKF_ASSIGN_OR_RETURN(const meta::TrainingSpec spec, meta::ReadTrainingSpec(specification));
@@ -59,7 +58,7 @@ absl::StatusOr<nssm::Bundle> TrainLearner(const Learner& learner, const data::Da
     data.trajectories.push_back(context);
     data.trajectories.back().name = "target";
   }
-  absl::StatusOr<nssm::Bundle> bundle = meta::Train(spec, data, nullptr, executor, nullptr);
+  absl::StatusOr<nssm::Bundle> bundle = meta::Train(spec, data, nullptr, executor, on_step);
   if (!bundle.ok()) return base::Annotate(bundle.status(), learner.label);
   return bundle;
 }

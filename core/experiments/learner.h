@@ -7,6 +7,7 @@
 #include "absl/status/statusor.h"
 #include "core/base/executor.h"
 #include "core/data/trajectory.h"
+#include "core/meta/train.h"
 #include "core/nssm/predict.h"
 
 namespace metaekf::experiments {
@@ -30,7 +31,7 @@ absl::Status CheckLearner(const Learner& learner);
 /// @param context  of the target system; used unless the learner trains on the fleet alone.
 /// Errors: those of meta::Train, beginning with the label.
 absl::StatusOr<nssm::Bundle> TrainLearner(const Learner& learner, const data::Dataset& fleet, const data::Trajectory& context,
-                                          uint64_t seed, base::Executor* executor);
+                                          uint64_t seed, base::Executor* executor, const meta::OnTrainingStep& on_step = nullptr);
 
 /// A model of one system, neural or not.
 struct SystemModel {

@@ -30,6 +30,8 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
+constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
+
 int Int(Index size) { return static_cast<int>(size); }
 int Leading(const MatrixXd& matrix) { return std::max(1, Int(matrix.rows())); }
 
@@ -87,6 +89,7 @@ SingularValues DecomposeSingularValues(MatrixXd a) {
             &size, integers.data(), &info);
   });
   result.v = transposed.transpose();
+  if (info != 0) result.values.setConstant(kNan);
   return result;
 }
 
@@ -99,6 +102,7 @@ SymmetricEigen DecomposeSymmetric(MatrixXd a) {
     dsyevd_("V", "L", &n, a.data(), &lda, result.values.data(), work, &size, workspace.data(), &integers, &info);
   });
   result.vectors = std::move(a);
+  if (info != 0) result.values.setConstant(kNan);
   return result;
 }
 
@@ -112,6 +116,7 @@ Eigen::VectorXcd Eigenvalues(MatrixXd a) {
   Eigen::VectorXcd values(n);
   values.real() = real;
   values.imag() = imaginary;
+  if (info != 0) values.setConstant(kNan);
   return values;
 }
 

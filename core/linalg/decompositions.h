@@ -5,7 +5,8 @@
 namespace metaekf::linalg {
 
 // Dense decompositions of matrices of some hundred rows, by LAPACK, which picks its kernels for the processor at run time.
-// Eigen's own would be compiled anew, for the least of processors, in every source that uses them.
+// Eigen's own would be compiled anew, for the least of processors, in every source that uses them. Where an iteration of
+// LAPACK does not come to its end, as on matrices with NaN, values are NaN.
 
 /// A = L Lᵀ of a symmetric positive definite A, of which the lower triangle is read.
 class Cholesky {

@@ -42,6 +42,16 @@ TEST(ProgressTest, OneReportAloneTellsNoPace) {
   EXPECT_THAT(err.str(), AllOf(HasSubstr("1/60"), Not(HasSubstr("left"))));
 }
 
+TEST(ProgressTest, OtherWorkHasAPaceOfItsOwn) {
+  std::istringstream in;
+  std::ostringstream out, err;
+  Console console(in, out, err, true);
+  Progress bar(console, "studying");
+  bar.Update(0, 8, {}, "training");
+  bar.Update(1, 120, {}, "adapting");  // the first of its kind: how long it took is not known
+  EXPECT_THAT(err.str(), AllOf(HasSubstr("1/120"), Not(HasSubstr("left"))));
+}
+
 TEST(ProgressTest, ElsewhereThereIsNoBar) {
   std::istringstream in;
   std::ostringstream out, err;

@@ -6,6 +6,7 @@
 #include <Eigen/LU>
 #include <algorithm>
 #include <complex>
+#include <limits>
 
 #include "core/base/rng.h"
 
@@ -91,6 +92,13 @@ TEST(CholeskyTest, RefusesWhatIsNotPositiveDefinite) {
   EXPECT_FALSE(Cholesky(a).ok());
   a(2, 2) = std::nan("");
   EXPECT_FALSE(Cholesky(a).ok());
+}
+
+TEST(DecompositionsTest, WhatHasNoDecompositionHasNoValues) {
+  const MatrixXd a = MatrixXd::Constant(5, 5, std::numeric_limits<double>::quiet_NaN());
+  EXPECT_TRUE(DecomposeSingularValues(a).values.array().isNaN().all());
+  EXPECT_TRUE(DecomposeSymmetric(a).values.array().isNaN().all());
+  EXPECT_TRUE(Eigenvalues(a).real().array().isNaN().all());
 }
 
 TEST(LeastSquaresTest, OfAllSolutionsTheShortestIsTaken) {

@@ -1,6 +1,6 @@
 metaekf_test(core/meta/arx_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/covariance_structure_test.cc DEPS metaekf::core_meta)
-metaekf_test(core/meta/empirical_bayes_test.cc DEPS metaekf::core_meta)
+metaekf_test(core/meta/empirical_bayes_test.cc TIMEOUT 600 DEPS metaekf::core_meta)
 metaekf_test(core/meta/implicit_gradient_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/known_answers_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/levenberg_marquardt_test.cc DEPS metaekf::core_meta)
