@@ -27,6 +27,7 @@ constexpr uint64_t kTestSeed = 666001;    // + run: of the tests
 constexpr int64_t kScoredFrom = 64;       // of a test: beyond the warm-up of every model
 constexpr int64_t kPeriodSamples = 750;   // of 120 sin 2πt
 constexpr int kFullSteps = 500;           // of Adam at adaptation: one target bears more than the hundred of a few-shot curve
+constexpr double kDiverged = 1;         // m, a thousand times the signal: an error beyond it is a failure, whatever its size
 constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
 
 struct Scale {
@@ -109,10 +110,14 @@ absl::Status Judge(const SystemModel& model, const std::vector<Trajectory>& test
     free.push_back(std::move(freely));
   }
   const nssm::Score near = nssm::ScorePredictions(truths, one_step), far = nssm::ScorePredictions(truths, free);
-  outcome->one_step_rmse = near.rmse[0];
-  outcome->one_step_fit = near.fit_percent[0];
-  outcome->free_rmse = far.rmse[0];
-  outcome->free_fit = far.fit_percent[0];
+  if (near.rmse[0] < kDiverged) {
+    outcome->one_step_rmse = near.rmse[0];
+    outcome->one_step_fit = near.fit_percent[0];
+  }
+  if (far.rmse[0] < kDiverged) {
+    outcome->free_rmse = far.rmse[0];
+    outcome->free_fit = far.fit_percent[0];
+  }
   outcome->free = std::move(free[0]);
   return absl::OkStatus();
 }
@@ -259,6 +264,34 @@ size_t BestModel(const Results& results) {
   return best;
 }
 
+/// "Gaussian prior: 2e-05 m from the multisine fleet, 4e-05 m from the sine fleet": mean errors in free run of two rows.
+std::string Compare(const Table& rmse, size_t column, const std::string& what, const std::string& row, const std::string& of_row,
+                    const std::string& other_row, const std::string& of_other_row) {
+  const auto mean = [&](const std::string& label) {
+    const auto place = std::find_if(rmse.rows.begin(), rmse.rows.end(), [&label](const Row& one) { return one.label == label; });
+    const double value = place == rmse.rows.end() ? kNan : Summarise(place->cells[column], false).mean;
+    return std::isfinite(value) ? base::FormatShort(value, 3) + " m" : std::string("failed");
+  };
+  return absl::StrCat(what, ": ", mean(row), " ", of_row, ", ", mean(other_row), " ", of_other_row);
+}
+
+/// What fleet and network change, after the shortest and the longest context.
+std::vector<std::string> Findings(const Table& rmse, const std::string& printed_label) {
+  std::vector<std::string> findings;
+  for (const size_t column : {size_t{0}, rmse.columns.size() - 1}) {
+    const auto of_fleets = [&](const std::string& learner) {
+      return Compare(rmse, column, learner, learner + ", multisine fleet", "from the multisine fleet", learner + ", sine fleet",
+                     "from the sine fleet");
+    };
+    const std::string after = absl::StrCat(" after ", rmse.columns[column].name, " samples. ");
+    findings.push_back(absl::StrCat("What the fleet changes", after, of_fleets("Gaussian prior"), "; ", of_fleets("MAML"), "."));
+    findings.push_back(absl::StrCat("What the network changes", after,
+                                    Compare(rmse, column, "MAML", "MAML, multisine fleet", "with the small network",
+                                            printed_label + ", multisine fleet", "with the printed one"), "."));
+  }
+  return findings;
+}
+
 absl::StatusOr<Picture> DrawPrediction(const std::string& label, const Outcome& outcome, const Trajectory& test) {
   constexpr Eigen::Index kShown = 750;  // one second
   const Eigen::Index shown = std::min<Eigen::Index>(kShown, outcome.free.cols());
@@ -343,6 +376,9 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
   const size_t best = BestModel(results);
   report.findings = {absl::StrCat("Best in free run after ", scale.lengths.back(), " samples: ", results.labels[best], " with ",
                                   base::FormatShort(results.outcomes[best][0].back().free_rmse, 3), " m.")};
+  for (std::string& finding : Findings(report.tables[0], PrintedMaml(options.budget).label)) {
+    report.findings.push_back(std::move(finding));
+  }
   METAEKF_ASSIGN_OR_RETURN(const Target target, MakeTarget(options, scale, 0, executor));
   METAEKF_ASSIGN_OR_RETURN(Picture performance,
                            DrawPrediction(results.labels[best], results.outcomes[best][0].back(), target.tests[0]));
