@@ -372,6 +372,7 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
       Times(results, scale)};
   report.tables[0].notes = {
       "Tests are multisines of the nominal system with fresh phases, without noise; mean ± standard deviation over runs.",
+      "From scratch with 20 and 80 % of the signal, 8192 and 32768 samples: the paper's Sup/Tr20 and Sup/Tr80.",
       "Univ is trained with the longest context. The printed network has a fraction of the paper's 10,000 epochs: not converged."};
   const size_t best = BestModel(results);
   report.findings = {absl::StrCat("Best in free run after ", scale.lengths.back(), " samples: ", results.labels[best], " with ",
