@@ -13,7 +13,7 @@ namespace {
 
 using nlohmann::json;
 
-constexpr int32_t kScratchSteps = 2000;  // of a gradient-based fit at most
+constexpr int32_t kScratchSteps = 1000;  // of a gradient-based fit at most
 
 /// The recipe of deploy/specs/bouc-wen.textproto, a round less: fits in free run over whole recordings, starts fitted, no encoder.
 constexpr char kGaussianPrior[] = R"json({
@@ -62,7 +62,7 @@ constexpr Variant kVariants[] = {
 
 /// Some minutes for all learners together: a smaller network and fewer steps of everything, for the order of things.
 constexpr char kQuick[] = R"json({
-  "iterations": 700, "warmup_iterations": 600,
+  "iterations": 500, "warmup_iterations": 400,
   "gaussian_prior": {"restarts": 3, "first_steps": 40, "round_steps": 10, "rounds": 1}
 })json";
 

@@ -33,9 +33,8 @@ struct Scale {
 };
 
 Scale ScaleOf(const Options& options) {
-  const std::vector<int64_t> lengths = {100, 200, 300, 500, 800, 2048, 8192};
-  Scale scale = options.budget == Budget::kFull    ? Scale{100, 60, 4096, 4096, lengths}
-                : options.budget == Budget::kQuick ? Scale{10, 60, 2048, 4096, lengths}
+  Scale scale = options.budget == Budget::kFull    ? Scale{100, 60, 4096, 4096, {100, 200, 300, 500, 800, 2048, 8192}}
+                : options.budget == Budget::kQuick ? Scale{10, 60, 2048, 4096, {100, 200, 300, 500, 800, 2048}}
                                                    : Scale{2, 4, 300, 200, {120, 200}};
   if (options.seeds) scale.targets = *options.seeds;
   return scale;
