@@ -9,8 +9,8 @@ namespace metaekf::experiments {
 
 inline constexpr char kFromScratchLabel[] = "SSM from scratch", kByGradientsLabel[] = "SSM from scratch, gradient steps";
 
-/// Small networks in double precision: what a fleet of Bouc–Wen oscillators can be learned with here. Those that this build
-/// does not know are left out.
+/// Small networks in double precision: what a fleet of Bouc–Wen oscillators can be learned with here. The first is the Gaussian
+/// prior, the second MAML.
 std::vector<Learner> BoucWenLearners(Budget budget);
 
 /// MAML with the network that the paper prints, in a fraction of its training.

@@ -60,8 +60,8 @@ std::vector<ClassicalModel> ClassicalModels() { return {Arx(5), OutputError(5), 
 std::vector<Learner> Learners(Budget budget) {
   std::vector<Learner> learners = BoucWenLearners(budget);
   for (Learner& learner : learners) {
-    json& adaptation = learner.specification["adaptation"];
-    if (budget == Budget::kFull && adaptation["optimiser"] == "ADAM") adaptation["steps"] = kFullSteps;
+    const bool by_gradients = learner.specification.value(json::json_pointer("/adaptation/optimiser"), "") == "ADAM";
+    if (budget == Budget::kFull && by_gradients) learner.specification["adaptation"]["steps"] = kFullSteps;
   }
   const auto transferred =
       std::find_if(learners.begin(), learners.end(), [](const Learner& one) { return one.label == "Xfer"; });

@@ -7,6 +7,8 @@
 #include <fstream>
 #include <set>
 
+#include "core/experiments/learner.h"
+
 namespace metaekf::experiments {
 namespace {
 
@@ -54,6 +56,17 @@ TEST_P(EveryExperiment, RunsEndToEndAndTheSameOnAnyNumberOfThreads) {
     EXPECT_EQ(picture.svg.find("nan"), std::string::npos);
   }
   EXPECT_EQ(WithoutTimes(report), WithoutTimes(RunTiny(experiment(), 2)));
+}
+
+TEST_P(EveryExperiment, EveryLearnerOfEveryBudgetHasASpecificationThatIsAccepted) {
+  for (const Budget budget : {Budget::kTiny, Budget::kQuick, Budget::kFull}) {
+    const nlohmann::json protocol = experiment().protocol({.budget = budget});
+    EXPECT_GE(protocol["learners"].size(), 5u);
+    for (const nlohmann::json& learner : protocol["learners"]) {
+      const absl::Status status = CheckLearner({learner["label"], TrainingData::kFleet, learner["specification"]});
+      EXPECT_TRUE(status.ok()) << status;
+    }
+  }
 }
 
 TEST_P(EveryExperiment, WritesItsProtocolAndItsReport) {
