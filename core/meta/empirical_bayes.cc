@@ -35,6 +35,19 @@ double Median(std::vector<double> values) {
   return values[values.size() / 2];
 }
 
+/// A⁻¹ of a matrix that is positive definite but for rounding, as the information of data without noise is: with the least
+/// ridge along its diagonal that lets it be factored. Nothing if none does.
+std::optional<MatrixXd> InverseOf(const MatrixXd& a) {
+  constexpr double kFirstRidge = 1e-16, kLastRidge = 1e-8;
+  for (double ridge = 0; ridge <= kLastRidge; ridge = std::max(kFirstRidge, 10 * ridge)) {
+    MatrixXd regular = a;
+    regular.diagonal() *= 1 + ridge;
+    const linalg::Cholesky factor(std::move(regular));
+    if (factor.ok()) return factor.Inverse();
+  }
+  return std::nullopt;
+}
+
 /// A workspace that is made again only for sets of another shape.
 class SlotWorkspace {
  public:
@@ -165,10 +178,10 @@ class Learner {
                             workspaces_[slot].For(plan_.dynamics, data_[s].shape));
         const MapFit& fit = found.ok() && !(own.cost <= found->fit.cost) ? found->fit : own;
         population_.fits[s] = fit.unknowns;
-        const linalg::Cholesky factor(fit.information);
+        const std::optional<MatrixXd> covariance = InverseOf(fit.information);
         mean_squares[s] = std::numeric_limits<double>::infinity();
-        if (!factor.ok()) return;  // a fit that failed: it is not accepted
-        covariances[s] = factor.Inverse();
+        if (!covariance) return;  // a fit that failed: it is not accepted
+        covariances[s] = *covariance;
         const double samples = static_cast<double>(Samples(data_[s]));
         const double determined =
             static_cast<double>(fit.unknowns.size()) - (covariances[s] * belief.precision).trace();
@@ -216,9 +229,9 @@ class Learner {
     if (options_.covariance == PriorCovariance::kManifold) population->loadings = structured.loadings;
     Belief& belief = population->belief;
     belief.mean = mean;
-    const linalg::Cholesky factor(covariance);
-    if (!factor.ok()) return absl::OutOfRangeError("the training diverged: the fits of the fleet have no covariance");
-    belief.precision = factor.Inverse();
+    const std::optional<MatrixXd> precision = InverseOf(covariance);
+    if (!precision) return absl::OutOfRangeError("the training diverged: the fits of the fleet have no covariance");
+    belief.precision = *precision;
     for (Index c = 0; c < belief.noise_variance.size(); ++c) {
       if (!std::isfinite(belief.noise_variance[c])) continue;
       std::vector<double> of_channel;
