@@ -99,7 +99,7 @@ class TypedFilterModel : public FilterModel {
     if (!prior_) return Run(encode_, parameters, window, VectorXd(), latent, nullptr, scratch);
     TypedScratch& s = static_cast<TypedScratch&>(*scratch);
     s.window = window;
-    *latent = s.start_fit->Fit(static_cast<const TypedParameters&>(parameters).exact.data(), s.window, 1).col(0);
+    *latent = s.start_fit->Fit(static_cast<const TypedParameters&>(parameters).exact.data(), s.window).col(0);
   }
 
   MatrixXd EncodedCovariance(const Scratch& scratch) const override {

@@ -129,20 +129,10 @@ class Predictor {
 
   /// ψ of samples first … first + count − 1 where the model has no encoder.
   MatrixT<T> FitLatents(Index first, Index count) const {
-    MatrixT<T> latents(spec_.latent_size, count);
-    const int32_t width = static_cast<int32_t>(std::min<Index>(kFittedWindows, count));
-    StartFit fit(model_, *bundle_.prior, width);
-    Eigen::MatrixXd windows(model_.start_size(), width);
-    for (Index j = 0; j < count; j += width) {
-      const Index some = std::min<Index>(width, count - j);
-      for (Index i = 0; i < some; ++i) {
-        const Index t = first + j + i;
-        windows.col(i) << Stacked(t - warmup_ + 1);
-      }
-      latents.middleCols(j, some) =
-          fit.Fit(bundle_.parameters.data(), windows, static_cast<int32_t>(some)).leftCols(some).template cast<T>();
-    }
-    return latents;
+    StartFit fit(model_, *bundle_.prior, static_cast<int32_t>(std::min<Index>(kFittedWindows, count)));
+    Eigen::MatrixXd windows(model_.start_size(), count);
+    for (Index j = 0; j < count; ++j) windows.col(j) = Stacked(first + j - warmup_ + 1);
+    return fit.Fit(bundle_.parameters.data(), windows).template cast<T>();
   }
 
   /// The window that begins at sample `first`, in double.

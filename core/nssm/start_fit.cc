@@ -20,9 +20,9 @@ namespace {
 
 enum Slot : int32_t { kParameters, kCarry, kInput, kNextOut, kOutputOut, kByCarryNextOut, kByCarryOutputOut };
 
-constexpr int kPasses = 15;
+constexpr int kPasses = 60;  // of one window: a guess that is none needs up to 30, a good one a few
 constexpr double kFirstDamping = 1e-3, kDampingFactor = 10;
-constexpr double kConverged = 1e-6;  // relative decrease of the cost that a column stops at
+constexpr double kConverged = 1e-6;  // relative change of the cost that a window stops at
 
 }  // namespace
 
@@ -59,23 +59,29 @@ StartFit::StartFit(const Model& model, const GaussianPrior& prior, int32_t width
                                           {tangents[1], kByCarryOutputOut}}));
   arena_.emplace(std::initializer_list<const autodiff::Executable<double>*>{&*step_});
   const Point point{VectorXd::Zero(n), VectorXd::Zero(n), VectorXd::Zero(n), MatrixXd::Zero(n, n), MatrixXd::Zero(n, n), 0};
-  best_.assign(static_cast<size_t>(width), point);
-  trial_ = best_;
-  damping_.assign(static_cast<size_t>(width), 0);
+  places_.assign(static_cast<size_t>(width), {.best = point, .trial = point});
   carry_.setZero(n, width);
   next_.setZero(n, width);
   input_.setZero(input_size_, width);
   output_.setZero(output_size_, width);
   by_carry_next_.setZero(n, n * width);
   by_carry_output_.setZero(output_size_, n * width);
-  result_.setZero(n, width);
   damped_.setZero(n, n);
   product_.setZero(n, n);
   row_.setZero(n);
   step_vector_.setZero(n);
 }
 
-void StartFit::Evaluate(const double* parameters, const MatrixXd& windows, int32_t count) {
+void StartFit::Begin(Place* place, Index window, const MatrixXd& windows) {
+  place->window = window;
+  place->passes = 0;
+  place->damping = kFirstDamping;
+  place->best.cost = std::numeric_limits<double>::infinity();
+  place->trial.start = guess_.col(windows.rows());
+  place->trial.start.noalias() += guess_.leftCols(windows.rows()).lazyProduct(windows.col(window));
+}
+
+void StartFit::Evaluate(const double* parameters, const MatrixXd& windows) {
   const Index n = latent_size_, rows = input_size_ + output_size_;
   autodiff::Slots<double> slots;
   slots.Input(kParameters, parameters)
@@ -85,8 +91,10 @@ void StartFit::Evaluate(const double* parameters, const MatrixXd& windows, int32
       .Output(kOutputOut, output_.data())
       .Output(kByCarryNextOut, by_carry_next_.data())
       .Output(kByCarryOutputOut, by_carry_output_.data());
-  for (int32_t j = 0; j < count; ++j) {
-    Point& p = trial_[static_cast<size_t>(j)];
+  for (Index j = 0; j < width_; ++j) {
+    Place& place = places_[static_cast<size_t>(j)];
+    if (place.window == kNone) continue;
+    Point& p = place.trial;
     carry_.col(j) = p.start;
     p.sensitivity.setIdentity();
     p.information = start_precision_;
@@ -94,12 +102,17 @@ void StartFit::Evaluate(const double* parameters, const MatrixXd& windows, int32
     p.cost = 0.5 * p.start.dot(p.gradient);
   }
   for (Index k = 0; k + 1 < window_; ++k) {
-    input_.leftCols(count) = windows.block((k + input_shift_) * rows, 0, input_size_, count);
+    for (Index j = 0; j < width_; ++j) {
+      const Index window = places_[static_cast<size_t>(j)].window;
+      if (window != kNone) input_.col(j) = windows.block((k + input_shift_) * rows, window, input_size_, 1);
+    }
     autodiff::Evaluate(*step_, slots, *arena_);
-    for (int32_t j = 0; j < count; ++j) {
-      Point& p = trial_[static_cast<size_t>(j)];
+    for (Index j = 0; j < width_; ++j) {
+      Place& place = places_[static_cast<size_t>(j)];
+      if (place.window == kNone) continue;
+      Point& p = place.trial;
       for (Index c = 0; c < output_size_; ++c) {
-        const double residual = output_(c, j) - windows((k + 1) * rows + input_size_ + c, j);
+        const double residual = output_(c, j) - windows((k + 1) * rows + input_size_ + c, place.window);
         row_.setZero();
         for (Index i = 0; i < n; ++i) row_ += by_carry_output_(c, i * width_ + j) * p.sensitivity.row(i).transpose();
         p.cost += 0.5 * weights_[c] * residual * residual;
@@ -114,56 +127,70 @@ void StartFit::Evaluate(const double* parameters, const MatrixXd& windows, int32
     }
     carry_ = next_;
   }
-  for (int32_t j = 0; j < count; ++j) {
-    Point& p = trial_[static_cast<size_t>(j)];
+  for (Index j = 0; j < width_; ++j) {
+    Point& p = places_[static_cast<size_t>(j)].trial;
     p.end = carry_.col(j);
     if (!std::isfinite(p.cost)) p.cost = std::numeric_limits<double>::infinity();
   }
 }
 
-const MatrixXd& StartFit::Fit(const double* parameters, const MatrixXd& windows, int32_t count) {
-  for (int32_t j = 0; j < count; ++j) {
-    VectorXd& start = trial_[static_cast<size_t>(j)].start;
-    start = guess_.col(windows.rows());
-    start.noalias() += guess_.leftCols(windows.rows()).lazyProduct(windows.col(j));
+/// Keeps what is better. Whether the window is done.
+bool StartFit::Judge(Place* place) {
+  const double change = std::abs(place->best.cost - place->trial.cost);
+  const bool better = place->trial.cost < place->best.cost || place->passes == 0;
+  ++place->passes;
+  const bool is_step = place->passes > 2;  // the first two are the guess and the origin
+  const bool converged = is_step && std::isfinite(change) && change <= kConverged * place->best.cost;
+  if (better) std::swap(place->best, place->trial);
+  if (is_step) place->damping *= better ? 1 / kDampingFactor : kDampingFactor;
+  return converged || place->passes == kPasses;
+}
+
+void StartFit::Propose(Place* place) {
+  if (place->passes == 1) {
+    place->trial.start.setZero();
+    return;
   }
-  Evaluate(parameters, windows, count);
-  for (int32_t j = 0; j < count; ++j) {
-    std::swap(best_[static_cast<size_t>(j)], trial_[static_cast<size_t>(j)]);
-    damping_[static_cast<size_t>(j)] = kFirstDamping;
+  damped_ = place->best.information;
+  damped_.diagonal() *= 1 + place->damping;
+  const Eigen::LLT<Eigen::Ref<MatrixXd>> factor(damped_);
+  step_vector_ = place->best.gradient;
+  factor.solveInPlace(step_vector_);
+  place->trial.start = place->best.start - step_vector_;
+}
+
+const MatrixXd& StartFit::Fit(const double* parameters, const MatrixXd& windows) {
+  const Index count = windows.cols();
+  result_.resize(latent_size_, count);
+  Index next = 0, busy = 0;
+  for (Place& place : places_) {
+    place.window = kNone;
+    if (next == count) continue;
+    Begin(&place, next++, windows);
+    ++busy;
   }
-  for (int pass = 1; pass < kPasses; ++pass) {
-    for (int32_t j = 0; j < count; ++j) {
-      const Point& p = best_[static_cast<size_t>(j)];
-      damped_ = p.information;
-      damped_.diagonal() *= 1 + damping_[static_cast<size_t>(j)];
-      const Eigen::LLT<Eigen::Ref<MatrixXd>> factor(damped_);
-      step_vector_ = p.gradient;
-      factor.solveInPlace(step_vector_);
-      trial_[static_cast<size_t>(j)].start = p.start - step_vector_;
-    }
-    Evaluate(parameters, windows, count);
-    bool converged = true;
-    for (int32_t j = 0; j < count; ++j) {
-      Point &best = best_[static_cast<size_t>(j)], &trial = trial_[static_cast<size_t>(j)];
-      double& damping = damping_[static_cast<size_t>(j)];
-      if (trial.cost < best.cost) {
-        converged = converged && best.cost - trial.cost <= kConverged * best.cost;
-        std::swap(best, trial);
-        damping /= kDampingFactor;
+  while (busy > 0) {
+    Evaluate(parameters, windows);
+    for (Place& place : places_) {
+      if (place.window == kNone) continue;
+      if (!Judge(&place)) {
+        Propose(&place);
+        continue;
+      }
+      result_.col(place.window) = place.best.end;
+      if (next < count) {
+        Begin(&place, next++, windows);
       } else {
-        converged = converged && trial.cost - best.cost <= kConverged * best.cost;
-        damping *= kDampingFactor;
+        place.window = kNone;
+        --busy;
       }
     }
-    if (converged) break;
   }
-  for (int32_t j = 0; j < count; ++j) result_.col(j) = best_[static_cast<size_t>(j)].end;
   return result_;
 }
 
 MatrixXd StartFit::Covariance(int32_t column) const {
-  const Point& p = best_[static_cast<size_t>(column)];
+  const Point& p = places_[static_cast<size_t>(column)].best;
   return p.sensitivity * p.information.llt().solve(p.sensitivity.transpose());
 }
 
