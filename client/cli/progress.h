@@ -28,7 +28,7 @@ class Progress {
   Console& console_;
   std::string label_;
   Clock::time_point last_ = Clock::now();
-  /// The first report of so many pieces in all, and what was done by then: what came before it may have been other work.
+  /// The first report of this work, told by its number of pieces and by less done than before, and what was done by then.
   struct Begin {
     Clock::time_point at;
     uint64_t done, total;

@@ -138,10 +138,9 @@ absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learn
   std::vector<Training> trainings;
   for (const Learner& learner : learners) {
     const auto tell = [&](int32_t iteration, int32_t iterations) {
-      const std::string what = absl::StrCat("training ", learner.label, ", ", 100 * int64_t{iteration} / iterations, " %");
-      return !on_progress || on_progress(trainings.size(), learners.size(), what);
+      const std::string what = absl::StrCat("training ", learner.label, " (", trainings.size() + 1, " of ", learners.size(), ")");
+      return !on_progress || on_progress(static_cast<size_t>(iteration), static_cast<size_t>(iterations), what);
     };
-    if (!tell(0, 1)) return absl::CancelledError("the study was cancelled");
     const PeakMemory memory;
     const Clock::time_point begin = Clock::now();
     METAEKF_ASSIGN_OR_RETURN(nssm::Bundle bundle,

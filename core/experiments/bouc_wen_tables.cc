@@ -39,7 +39,7 @@ struct Scale {
 
 Scale ScaleOf(const Options& options) {
   Scale scale = options.budget == Budget::kFull    ? Scale{2, 40, 10000, 2, 8192, {500, 8192, 32768, 40960}}
-                : options.budget == Budget::kQuick ? Scale{1, 40, 2048, 1, 8192, {500, 8192}}
+                : options.budget == Budget::kQuick ? Scale{1, 24, 2048, 1, 4096, {500, 8192}}
                                                    : Scale{1, 4, 300, 1, 200, {120, 200}};
   if (options.seeds) scale.runs = *options.seeds;
   if (options.recording) {
@@ -160,28 +160,32 @@ absl::StatusOr<Target> MakeTarget(const Options& options, const Scale& scale, ui
 
 using Fit = std::function<absl::StatusOr<SystemModel>(const Trajectory& context)>;
 
-/// Fits and judges models at every length, side by side; of the greatest one after the other, for their memory to be told
-/// apart.
+/// Fits models at every length, side by side; at the greatest one after the other, for their memory to be told apart. Judges
+/// them side by side.
 absl::Status JudgeAll(const std::vector<std::pair<size_t, Fit>>& models, const Scale& scale, const Target& target,
                       base::Executor* executor, const OnProgress& on_progress, Results* results) {
   const size_t lengths = scale.lengths.size();
   std::vector<Outcome> outcomes(models.size() * lengths);
-  const auto judge = [&](size_t model_index, size_t length, bool alone) -> absl::Status {
+  std::vector<absl::StatusOr<SystemModel>> fitted(outcomes.size(), absl::UnknownError("not fitted"));
+  const auto fit = [&](size_t model, size_t length, bool alone) -> absl::Status {
     METAEKF_ASSIGN_OR_RETURN(const Trajectory context, data::FirstSamples(target.signal, scale.lengths[length]));
-    Outcome& outcome = outcomes[model_index * lengths + length];
+    const size_t place = model * lengths + length;
     std::optional<PeakMemory> memory;
     if (alone) memory.emplace();
     const double begin = ThreadSeconds();
-    const absl::StatusOr<SystemModel> model = models[model_index].second(context);
-    outcome.seconds = ThreadSeconds() - begin;
-    if (memory) outcome.memory_mib = memory->MiB();
-    outcome.measured = !absl::IsFailedPrecondition(model.status());
-    return model.ok() ? Judge(*model, target.tests, &outcome) : absl::OkStatus();
+    fitted[place] = models[model].second(context);
+    outcomes[place].seconds = ThreadSeconds() - begin;
+    if (memory) outcomes[place].memory_mib = memory->MiB();
+    outcomes[place].measured = !absl::IsFailedPrecondition(fitted[place].status());
+    return absl::OkStatus();
   };
-  METAEKF_RETURN_IF_ERROR(RunJobs(models.size() * (lengths - 1), executor, "models adapted and judged", on_progress,
-                                  [&](size_t job) { return judge(job / (lengths - 1), job % (lengths - 1), false); }));
+  METAEKF_RETURN_IF_ERROR(RunJobs(models.size() * (lengths - 1), executor, "models adapted", on_progress,
+                                  [&](size_t job) { return fit(job / (lengths - 1), job % (lengths - 1), false); }));
   METAEKF_RETURN_IF_ERROR(RunJobs(models.size(), base::CallingThread(), "models adapted to the longest context", on_progress,
-                                  [&](size_t job) { return judge(job, lengths - 1, true); }));
+                                  [&](size_t job) { return fit(job, lengths - 1, true); }));
+  METAEKF_RETURN_IF_ERROR(RunJobs(outcomes.size(), executor, "models judged", on_progress, [&](size_t job) {
+    return fitted[job].ok() ? Judge(*fitted[job], target.tests, &outcomes[job]) : absl::OkStatus();
+  }));
   for (size_t i = 0; i < models.size(); ++i) {
     const auto first = outcomes.begin() + static_cast<std::ptrdiff_t>(i * lengths);
     results->outcomes[models[i].first].emplace_back(first, first + static_cast<std::ptrdiff_t>(lengths));

@@ -34,7 +34,7 @@ struct Scale {
 
 Scale ScaleOf(const Options& options) {
   Scale scale = options.budget == Budget::kFull    ? Scale{100, 60, 4096, 4096, {100, 200, 300, 500, 800, 2048, 8192}}
-                : options.budget == Budget::kQuick ? Scale{10, 60, 2048, 4096, {100, 200, 300, 500, 800, 2048}}
+                : options.budget == Budget::kQuick ? Scale{8, 40, 2048, 4096, {100, 200, 300, 500, 800, 2048}}
                                                    : Scale{2, 4, 300, 200, {120, 200}};
   if (options.seeds) scale.targets = *options.seeds;
   return scale;

@@ -52,6 +52,16 @@ TEST(ProgressTest, OtherWorkHasAPaceOfItsOwn) {
   EXPECT_THAT(err.str(), AllOf(HasSubstr("1/120"), Not(HasSubstr("left"))));
 }
 
+TEST(ProgressTest, WorkThatBeginsAgainHasANewPace) {
+  std::istringstream in;
+  std::ostringstream out, err;
+  Console console(in, out, err, true);
+  Progress bar(console, "studying");
+  bar.Update(60, 100, {}, "training MAML");
+  bar.Update(1, 100, {}, "training Reptile");
+  EXPECT_THAT(err.str(), AllOf(HasSubstr("1/100, training Reptile"), Not(HasSubstr("left"))));
+}
+
 TEST(ProgressTest, ElsewhereThereIsNoBar) {
   std::istringstream in;
   std::ostringstream out, err;
