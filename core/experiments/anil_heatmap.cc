@@ -6,6 +6,7 @@
 #include "core/base/numbers.h"
 #include "core/base/status.h"
 #include "core/data/split.h"
+#include "core/experiments/classical.h"
 #include "core/experiments/jobs.h"
 #include "core/experiments/learner.h"
 #include "core/experiments/studies.h"
@@ -21,6 +22,7 @@ using nlohmann::json;
 constexpr uint64_t kFirstSeed = 1;          // of runs: fleet, initialisation and sampling
 constexpr int64_t kTargetSamples = 1000;    // 10 s
 constexpr int kEncoderLayers = 5;
+constexpr int kArxOrder = 5;
 constexpr int kShares[] = {10, 20, 30, 40, 50, 60, 70, 80, 90};  // % of the target's data
 
 struct Scale {
@@ -98,15 +100,14 @@ json Protocol(const Options& options) {
           {"target", "theta 1.572, x (1, -0.5), 10 s; adapted to its first part, simulated freely from its first sample"},
           {"noise_std", 0},
           {"shares_percent", kShares},
-          {"learners", learners}};
+          {"learners", learners},
+          {"classical", {Arx(kArxOrder).label}}};
 }
 
 /// RMSE of both states over all 10 s, simulated from the first sample, so that shares compare; not a number where the model
 /// diverged.
-double Error(const nssm::Bundle& bundle, const Trajectory& recording, int64_t context_samples) {
+double Error(const absl::StatusOr<SystemModel>& model, const Trajectory& recording) {
   const double failed = std::numeric_limits<double>::quiet_NaN();
-  const absl::StatusOr<Trajectory> context = data::FirstSamples(recording, context_samples);
-  const absl::StatusOr<SystemModel> model = AdaptToContext(bundle, *context);
   if (!model.ok()) return failed;
   const absl::StatusOr<Eigen::MatrixXd> free = PredictFreely(*model, recording, model->warmup);
   if (!free.ok()) return failed;
@@ -114,45 +115,47 @@ double Error(const nssm::Bundle& bundle, const Trajectory& recording, int64_t co
   return error < 1e3 ? error : failed;
 }
 
-Table ToTable(const std::vector<Learner>& learners, const std::vector<std::vector<std::vector<double>>>& errors, int runs) {
+/// A row each of `labels`.
+Table ToTable(const std::vector<std::string>& labels, const std::vector<std::vector<std::vector<double>>>& errors, int runs) {
   Table table{.name = "rmse", .title = absl::StrCat("RMSE of both states in a free run of 10 s, by share of it adapted to; mean ± "
                                                     "standard deviation of ", runs, " runs"),
               .summary = Summary::kMean, .row_heading = "learner"};
   for (const int share : kShares) table.columns.push_back({absl::StrCat(share, " %")});
-  for (size_t i = 0; i < learners.size(); ++i) table.rows.push_back({learners[i].label, errors[i]});
+  for (size_t i = 0; i < labels.size(); ++i) table.rows.push_back({labels[i], errors[i]});
+  table.notes = {"Linear ARX is fitted to the same samples; the target is the same in all runs, and so is this row."};
   return table;
 }
 
 double MeanOf(const Table& table, size_t row, size_t column) { return Summarise(table.rows[row].cells[column], false).mean; }
 
-/// Index of the row with the least (or greatest) mean in a column.
-size_t Extreme(const Table& table, size_t column, bool least) {
+/// Index of the row with the least (or greatest) mean in a column, among the first rows.
+size_t Extreme(const Table& table, size_t rows, size_t column, bool least) {
   size_t extreme = 0;
-  for (size_t row = 1; row < table.rows.size(); ++row) {
+  for (size_t row = 1; row < rows; ++row) {
     const double value = MeanOf(table, row, column), so_far = MeanOf(table, extreme, column);
     if (!std::isfinite(so_far) || (least ? value < so_far : value > so_far)) extreme = row;
   }
   return extreme;
 }
 
-/// What the paper concludes from its figure, asked of these numbers.
-std::vector<std::string> Findings(const Table& table) {
+/// What the paper concludes from its figure, asked of these numbers: those of the learners, which come first.
+std::vector<std::string> Findings(const Table& table, size_t learners) {
   std::vector<std::string> best, worst;
   size_t full_is_best = 0, helped = 0;
   for (size_t column = 0; column < std::size(kShares); ++column) {
-    const size_t least = Extreme(table, column, true);
+    const size_t least = Extreme(table, learners, column, true);
     full_is_best += least < 2 ? 1 : 0;
     best.push_back(absl::StrCat(kShares[column], " % ", table.rows[least].label));
-    worst.push_back(absl::StrCat(kShares[column], " % ", table.rows[Extreme(table, column, false)].label));
+    worst.push_back(absl::StrCat(kShares[column], " % ", table.rows[Extreme(table, learners, column, false)].label));
   }
-  for (size_t row = 0; row < table.rows.size(); ++row) {
+  for (size_t row = 0; row < learners; ++row) {
     helped += MeanOf(table, row, 4) < MeanOf(table, row, 0) ? 1 : 0;
   }
   return {absl::StrCat("Best at each share: ", absl::StrJoin(best, ", "), "."),
           absl::StrCat("Worst at each share: ", absl::StrJoin(worst, ", "), "."),
           absl::StrCat("The paper: adapting everything (MAML, FO-MAML) is best. Here it is at ", full_is_best, " of ",
                        std::size(kShares), " shares."),
-          absl::StrCat("The paper: 10 % is too little. Here ", helped, " of ", table.rows.size(),
+          absl::StrCat("The paper: 10 % is too little. Here ", helped, " of ", learners,
                        " learners are better with 50 % than with 10 %.")};
 }
 
@@ -176,6 +179,11 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
   METAEKF_ASSIGN_OR_RETURN(const sim::Fleet target, sim::Simulate(TargetRequest(), *executor));
   const Trajectory& recording = target.dataset.trajectories[0];
   const size_t runs = static_cast<size_t>(scale.runs), shares = std::size(kShares);
+  std::vector<Trajectory> contexts;
+  for (const int share : kShares) {
+    METAEKF_ASSIGN_OR_RETURN(Trajectory context, data::FirstSamples(recording, kTargetSamples * share / 100));
+    contexts.push_back(std::move(context));
+  }
   std::vector<std::vector<std::vector<double>>> errors(
       learners.size(), {shares, std::vector<double>(runs, std::numeric_limits<double>::quiet_NaN())});
   std::vector<std::vector<double>> seconds(learners.size(), std::vector<double>(runs));
@@ -191,15 +199,21 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
     seconds[i][run] = ThreadSeconds() - begin;
     if (absl::IsOutOfRange(bundle.status())) return absl::OkStatus();  // diverged: this run has failed, no more
     METAEKF_RETURN_IF_ERROR(bundle.status());
-    for (size_t k = 0; k < shares; ++k) errors[i][k][run] = Error(*bundle, recording, kTargetSamples * kShares[k] / 100);
+    for (size_t k = 0; k < shares; ++k) errors[i][k][run] = Error(AdaptToContext(*bundle, contexts[k]), recording);
     return absl::OkStatus();
   });
   METAEKF_RETURN_IF_ERROR(studied);
-  Table table = ToTable(learners, errors, scale.runs);
+  std::vector<std::string> labels;
+  for (const Learner& learner : learners) labels.push_back(learner.label);
+  const ClassicalModel arx = Arx(kArxOrder);
+  labels.push_back(arx.label);
+  errors.emplace_back();
+  for (const Trajectory& context : contexts) errors.back().push_back({Error(arx.fit(context), recording)});
+  Table table = ToTable(labels, errors, scale.runs);
   Table times{.name = "times", .title = "Processor time", .row_heading = "learner", .columns = {{"training", "s"}}};
   for (size_t i = 0; i < learners.size(); ++i) times.rows.push_back({learners[i].label, {seconds[i]}});
   METAEKF_ASSIGN_OR_RETURN(Picture picture, Draw(table));
-  std::vector<std::string> findings = Findings(table);
+  std::vector<std::string> findings = Findings(table, learners.size());
   return Report{{std::move(table), std::move(times)}, std::move(findings), {std::move(picture)}};
 }
 
