@@ -29,7 +29,8 @@ constexpr char kGaussianPrior[] = R"json({
 })json";
 
 /// The gradient-based learners, after deploy/specs/bouc-wen-maml.textproto in half its iterations: the same transition behind a
-/// linear encoder of 40 samples.
+/// linear encoder of 40 samples. λ of iMAML is 1/(steps · learning_rate), where five steps do end near the minimum that its
+/// gradient is of: with less the training diverged.
 constexpr char kGradientBased[] = R"json({
   "model": {
     "case": "INPUT_OUTPUT", "latent_size": 6, "window": 40, "precision": "FLOAT64",
@@ -37,7 +38,7 @@ constexpr char kGradientBased[] = R"json({
                    "block": {"hidden_widths": [16], "activation": "TANH", "output_scale": 0.1}}
   },
   "loss": {"horizon": 20, "stride": 10},
-  "inner_loop": {"steps": 5, "learning_rate": 1e-4},
+  "inner_loop": {"steps": 5, "learning_rate": 1e-4, "proximal": 2000},
   "adaptation": {"steps": 300, "learning_rate": 1e-3, "optimiser": "ADAM"},
   "context_samples": 512, "target_samples": 512, "task_batch": 8, "clip_norm": 1, "validation_period": 50,
   "iterations": 4600, "warmup_iterations": 4000, "warmup_horizon": 20,
@@ -116,7 +117,9 @@ std::vector<Learner> BoucWenLearners(Budget budget) {
   return learners;
 }
 
-absl::StatusOr<SystemModel> FitFromScratch(const nssm::Bundle& bundle, const data::Trajectory& context, uint64_t seed) {
+absl::StatusOr<SystemModel> FitFromScratch(const absl::StatusOr<nssm::Bundle>& like, const data::Trajectory& context, uint64_t seed) {
+  METAEKF_RETURN_IF_ERROR(like.status());
+  const nssm::Bundle& bundle = *like;
   METAEKF_ASSIGN_OR_RETURN(meta::AdaptationOptions options,
                            meta::DefaultAdaptation(bundle, meta::AdaptationMethod::kFromScratch));
   options.seed = seed;
@@ -143,10 +146,11 @@ absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learn
     };
     const PeakMemory memory;
     const Clock::time_point begin = Clock::now();
-    METAEKF_ASSIGN_OR_RETURN(nssm::Bundle bundle,
-                             TrainLearner(learner, fleet, context, seed, executor, [&tell](const meta::TrainingProgress& step) {
-                               return tell(step.state.iteration, step.iterations);
-                             }));
+    absl::StatusOr<nssm::Bundle> bundle =
+        TrainLearner(learner, fleet, context, seed, executor, [&tell](const meta::TrainingProgress& step) {
+          return tell(step.state.iteration, step.iterations);
+        });
+    if (!bundle.ok() && !absl::IsOutOfRange(bundle.status())) return bundle.status();
     const double seconds = std::chrono::duration<double>(Clock::now() - begin).count();
     trainings.push_back({std::move(bundle), seconds, memory.MiB()});
   }

@@ -18,17 +18,17 @@ Learner PrintedMaml(Budget budget);
 
 /// A model that knows nothing but the context, fitted as `metaekf adapt --method from-scratch` does it: exactly (label
 /// kFromScratchLabel) where the start is fitted, else by gradient steps (kByGradientsLabel), both stopped early. Architecture
-/// and normaliser are those of `bundle`. Errors: those of meta::Adapt.
-absl::StatusOr<SystemModel> FitFromScratch(const nssm::Bundle& bundle, const data::Trajectory& context, uint64_t seed);
+/// and normaliser are those of `like`. Errors: those of meta::Adapt, and that of `like`.
+absl::StatusOr<SystemModel> FitFromScratch(const absl::StatusOr<nssm::Bundle>& like, const data::Trajectory& context, uint64_t seed);
 
 /// What a training has brought, and what it took.
 struct Training {
-  nssm::Bundle bundle;
+  absl::StatusOr<nssm::Bundle> bundle;  ///< OutOfRange if it diverged
   double seconds = 0;     ///< on the wall
   double memory_mib = 0;  ///< at its peak
 };
 
-/// Trains every learner on the fleet, one after the other with all threads.
+/// Trains every learner on the fleet, one after the other with all threads. One that diverges does not stop the others.
 /// @param context  of the target, for learners that train on it too.
 absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learners, const data::Dataset& fleet,
                                                const data::Trajectory& context, uint64_t seed, base::Executor* executor,

@@ -207,7 +207,10 @@ absl::Status RunOnce(const Options& options, const Scale& scale, uint64_t run, b
       const size_t index = results->IndexOf(absl::StrCat(learners[i].label, ", ", kind.label));
       results->training_s[index].push_back(trainings[i].seconds);
       results->training_mib[index].push_back(trainings[i].memory_mib);
-      models.emplace_back(index, [bundle = trainings[i].bundle](const Trajectory& context) { return AdaptToContext(bundle, context); });
+      models.emplace_back(index, [bundle = trainings[i].bundle](const Trajectory& context) -> absl::StatusOr<SystemModel> {
+        METAEKF_RETURN_IF_ERROR(bundle.status());
+        return AdaptToContext(*bundle, context);
+      });
     }
     if (kind.excitation != BoucWenExcitation::kMultisine) continue;
     for (const auto& [label, model] : {std::pair{kFromScratchLabel, 0}, {kByGradientsLabel, 1}}) {

@@ -107,7 +107,10 @@ struct Study {
   }
 
   absl::StatusOr<SystemModel> Fit(size_t model, const Trajectory& context) const {
-    if (model < learners.size()) return AdaptToContext(trainings[model].bundle, context);
+    if (model < learners.size()) {
+      METAEKF_RETURN_IF_ERROR(trainings[model].bundle.status());
+      return AdaptToContext(*trainings[model].bundle, context);
+    }
     if (model == learners.size()) return FitFromScratch(trainings[0].bundle, context, kFirstSeed);
     return classical[model - learners.size() - 1].fit(context);
   }
