@@ -7,6 +7,8 @@
 #include <fstream>
 #include <set>
 
+#include "core/experiments/bouc_wen_data.h"
+#include "core/experiments/bouc_wen_learners.h"
 #include "core/experiments/learner.h"
 
 namespace metaekf::experiments {
@@ -109,6 +111,21 @@ TEST(ExperimentTest, AnUnknownNameIsAnsweredWithThoseThatExist) {
   const auto found = FindExperiment("pendulum");
   EXPECT_TRUE(absl::IsNotFound(found.status()));
   EXPECT_THAT(std::string(found.status().message()), HasSubstr("van-der-pol-comparison"));
+}
+
+TEST(ExperimentTest, ALearnerThatDivergesDoesNotStopTheOthers) {
+  const auto executor = base::MakeThreadExecutor(2);
+  const auto fleet = BoucWenFleet(4, 300, BoucWenExcitation::kMultisine, 1, executor.get());
+  ASSERT_TRUE(fleet.ok()) << fleet.status();
+  const Learner maml = BoucWenLearners(Budget::kTiny)[1];
+  Learner diverging = maml;
+  diverging.specification["warmup_lr"] = 1000;
+  const auto trainings = TrainAll({diverging, maml}, fleet->dataset, {}, 1, executor.get(), nullptr);
+  ASSERT_TRUE(trainings.ok()) << trainings.status();
+  EXPECT_TRUE(absl::IsOutOfRange((*trainings)[0].bundle.status())) << (*trainings)[0].bundle.status();
+  EXPECT_TRUE((*trainings)[1].bundle.ok()) << (*trainings)[1].bundle.status();
+  const auto from_scratch = FitFromScratch((*trainings)[0].bundle, fleet->dataset.trajectories[0], 1);
+  EXPECT_EQ(from_scratch.status(), (*trainings)[0].bundle.status());
 }
 
 TEST(ExperimentTest, ADirectoryThatCannotBeWrittenIsNamed) {
