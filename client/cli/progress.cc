@@ -32,7 +32,8 @@ Progress::~Progress() {
 void Progress::Update(uint64_t done, uint64_t total, std::optional<double> time_left_s,
                       const std::string& text) {
   const Clock::time_point now = Clock::now();
-  const bool other_work = pace_from_ && (pace_from_->total != total || done < pace_from_->done);
+  const bool other_work = pace_from_ && (pace_from_->total != total || done < last_done_);
+  last_done_ = done;
   if (!pace_from_ || other_work) pace_from_ = {now, done, total};
   const bool at_once = other_work || (console_.err_is_terminal && !drawn_);
   if (!at_once && now - last_ < (console_.err_is_terminal ? Clock::duration(kRedraw)

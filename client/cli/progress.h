@@ -28,12 +28,13 @@ class Progress {
   Console& console_;
   std::string label_;
   Clock::time_point last_ = Clock::now();
-  /// The first report of this work, told by its number of pieces and by less done than before, and what was done by then.
+  /// The first report of this work, told from other work by its number of pieces or by less done than before, and what was done by then.
   struct Begin {
     Clock::time_point at;
     uint64_t done, total;
   };
   std::optional<Begin> pace_from_;
+  uint64_t last_done_ = 0;
   bool drawn_ = false;
 };
 

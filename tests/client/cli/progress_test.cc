@@ -57,7 +57,9 @@ TEST(ProgressTest, WorkThatBeginsAgainHasANewPace) {
   std::ostringstream out, err;
   Console console(in, out, err, true);
   Progress bar(console, "studying");
+  bar.Update(1, 100, {}, "training MAML");
   bar.Update(60, 100, {}, "training MAML");
+  err.str("");
   bar.Update(1, 100, {}, "training Reptile");
   EXPECT_THAT(err.str(), AllOf(HasSubstr("1/100, training Reptile"), Not(HasSubstr("left"))));
 }
