@@ -50,6 +50,7 @@ absl::StatusOr<double> GradientSeconds(meta::TrainingSpec spec, const data::Data
   const int32_t warmups = warmups_each + others * warmups_screening;
   const int32_t mains = all - warmups_each + others * (screening - warmups_screening);
   spec.warmup_iterations = warmup;
+  spec.horizon_growth_iterations = 0;  // counted as long as at the end
   spec.restarts = 1;
   const int32_t probes = warmup + std::min(mains, kProbeSteps);
   spec.iterations = probes + 1;

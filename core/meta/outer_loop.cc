@@ -37,10 +37,12 @@ double LearningRate(const TrainingSpec& spec, int32_t iteration) {
              : CosineDecay(spec.outer_lr, spec.final_outer_lr, iteration - warmup, spec.iterations - warmup);
 }
 
-/// Steps of the longest rollouts that an iteration has: short in the warm-up, then doubling at even distances while they grow.
+/// Steps of the longest rollouts that an iteration has: short in the warm-up, then doubling at even distances while they grow,
+/// of whole sets up to the length of the shorter set.
 int32_t HorizonOf(const TrainingSpec& spec, int32_t iteration) {
+  const int32_t shorter_set = std::min(spec.context_samples, spec.target_samples);
   const int32_t full = spec.loss.horizon == nssm::LossSpec::kWholeSet
-                           ? nssm::ShapeOfLoss(spec.model, spec.loss, spec.context_samples)->horizon
+                           ? nssm::ShapeOfLoss(spec.model, spec.loss, shorter_set)->horizon
                            : spec.loss.horizon;
   const int32_t first = std::min(spec.warmup_horizon, full), step = iteration - spec.warmup_iterations;
   if (step < 0) return first;
@@ -54,7 +56,11 @@ int32_t HorizonOf(const TrainingSpec& spec, int32_t iteration) {
 TrainingSpec SpecOf(const TrainingSpec& spec, int32_t iteration) {
   TrainingSpec own = spec;
   if (iteration < spec.warmup_iterations) own.algorithm = Algorithm::kSupervised;
-  if (HorizonOf(spec, iteration) != HorizonOf(spec, spec.iterations)) own.loss.horizon = HorizonOf(spec, iteration);
+  if (HorizonOf(spec, iteration) != HorizonOf(spec, spec.iterations)) {
+    own.loss.horizon = HorizonOf(spec, iteration);
+    // One rollout after the other, as many samples as the one of a whole set has.
+    if (spec.loss.horizon == nssm::LossSpec::kWholeSet) own.loss.stride = own.loss.horizon;
+  }
   return own;
 }
 
@@ -96,8 +102,9 @@ class Phase {
     return loss;
   }
 
-  /// Of every adapted tensor the largest curvature of the context loss that any of kCurvatureSystems systems has.
-  std::vector<double> Curvatures(const std::vector<double>& at) {
+  /// Of every adapted tensor the largest curvature of the context loss that any of kCurvatureSystems systems has; that of the
+  /// steepest tensor where there is none. Errors: OutOfRange if one is a number for no system.
+  absl::StatusOr<std::vector<double>> Curvatures(const std::vector<double>& at) {
     const std::vector<T> parameters(at.begin(), at.end());
     std::vector<std::vector<double>> of_systems(kCurvatureSystems);
     executor_->ParallelFor(of_systems.size(), [&](size_t index, size_t slot) {
@@ -105,9 +112,20 @@ class Phase {
       const Trajectory& system = systems_.training[rng.Index(systems_.training.size())];
       of_systems[index] = meta_gradient_.Curvatures(parameters.data(), DrawContext(system, &rng), &scratch_[slot]);
     });
-    std::vector<double> largest(of_systems.front().size());
+    constexpr double kNone = -1;
+    std::vector<double> largest(of_systems.front().size(), kNone);
     for (const std::vector<double>& own : of_systems) {
-      for (size_t l = 0; l < largest.size(); ++l) largest[l] = std::max(largest[l], own[l]);  // no number: does not count
+      for (size_t l = 0; l < largest.size(); ++l) {
+        if (std::isfinite(own[l])) largest[l] = std::max(largest[l], std::max(own[l], 0.0));
+      }
+    }
+    if (std::find(largest.begin(), largest.end(), kNone) != largest.end()) {
+      return absl::OutOfRangeError("inner_loop.curvature_rates: the loss after the warm-up has no finite curvature; a smaller "
+                                   "warmup_lr or a shorter horizon may help");
+    }
+    const double steepest = *std::max_element(largest.begin(), largest.end());
+    for (double& curvature : largest) {
+      if (curvature == 0) curvature = steepest;
     }
     return largest;
   }
@@ -211,7 +229,9 @@ LearnedStart TakeApart(const TrainingSpec& spec, const nssm::Model& model, const
   if (!spec.inner_loop.learned_rates) return result;
   auto rate = rates;
   for (size_t i = 0; i < mask.size(); ++i) {
-    if (mask[i]) result.tensor_rates[model.layout().tensors()[i].name] = std::exp(*rate++);
+    if (mask[i]) {
+      result.tensor_rates[model.layout().tensors()[i].name] = std::clamp(std::exp(*rate++), kSmallestRate, kLargestRate);
+    }
   }
   return result;
 }
@@ -323,7 +343,10 @@ class OuterLoop {
       // Another loss: the warm-up's squared gradients would throttle the first thousand steps on it.
       std::fill(first_moment.begin(), first_moment.end(), 0.0);
       std::fill(second_moment.begin(), second_moment.end(), 0.0);
-      if (spec_.inner_loop.curvature_rates) ScaleRates(main_.Curvatures(parameters), &parameters);
+      if (spec_.inner_loop.curvature_rates) {
+        METAEKF_ASSIGN_OR_RETURN(const std::vector<double> curvatures, main_.Curvatures(parameters));
+        ScaleRates(curvatures, &parameters);
+      }
     }
     const double loss = phase.Gradient(iteration, parameters, &gradient_);
     const double norm = ClipNorm(spec_.clip_norm, &gradient_);

@@ -26,8 +26,6 @@ constexpr int32_t kGaussianPriorSteps = 60;  // of Levenberg–Marquardt at adap
 
 constexpr int32_t kMany = 100'000'000;
 
-constexpr double kSmallestRate = 1e-12, kLargestRate = 1e6;
-
 template <typename Enum>
 std::string NameOf(const std::vector<std::pair<std::string, Enum>>& names, Enum value) {
   for (const auto& [name, candidate] : names) {
@@ -142,6 +140,13 @@ void CheckHorizonGrowth(const TrainingSpec& spec, JsonFields* fields) {
   }
 }
 
+/// Rates at the inverse curvature are found when the warm-up ends.
+void CheckCurvatureRates(const TrainingSpec& spec, JsonFields* fields) {
+  if (!spec.inner_loop.curvature_rates || spec.warmup_iterations < spec.iterations) return;
+  fields->Fail("warmup_iterations", absl::StrCat("must be less than the ", spec.iterations,
+                                                 " iterations if there are curvature_rates, which begin after the warm-up"));
+}
+
 /// Whether there is something to choose among several starts by.
 void CheckRestarts(const TrainingSpec& spec, JsonFields* fields) {
   if (spec.restarts == 1) return;
@@ -188,6 +193,7 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
   spec.warmup_horizon = positive("warmup_horizon", spec.warmup_horizon);
   spec.horizon_growth_iterations = static_cast<int32_t>(fields.Integer("horizon_growth_iterations", 0, 0, kMany));
   CheckHorizonGrowth(spec, &fields);
+  CheckCurvatureRates(spec, &fields);
   spec.outer_lr = fields.Number("outer_lr", spec.outer_lr, 0, 1e3);
   spec.warmup_lr = fields.Number("warmup_lr", spec.outer_lr, 0, 1e3);
   spec.final_outer_lr = fields.Number("final_outer_lr", spec.outer_lr, 0, 1e3);

@@ -13,6 +13,8 @@ enum class Algorithm { kMaml, kFirstOrderMaml, kSupervised, kGaussianPrior, kRep
 
 enum class Optimiser { kGradientDescent, kAdam, kLevenbergMarquardt };
 
+inline constexpr double kSmallestRate = 1e-12, kLargestRate = 1e6;  // of an inner step
+
 /// The inner loop, in training or at adaptation: the message InnerLoopSpec of spec.proto.
 struct InnerLoopSpec {
   int32_t steps = 10;

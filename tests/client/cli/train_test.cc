@@ -77,6 +77,7 @@ TEST_F(TrainTest, ADryRunEstimatesWithoutAServer) {
     return json["estimated_duration_s"].get<double>();
   };
   EXPECT_GT(seconds(fits), 0);
+  EXPECT_GT(seconds(gradients + "1000 warmup_iterations: 100 horizon_growth_iterations: 500"), 0);
   // A thousand times the steps: about as many times the duration.
   EXPECT_GT(seconds(gradients + "1000000"), 20 * seconds(gradients + "1000"));
 }

@@ -10,6 +10,7 @@
 #include "core/meta/adapt.h"
 #include "core/base/rng.h"
 #include "core/data/split.h"
+#include "core/meta/meta_gradient.h"
 #include "core/nssm/model_file.h"
 
 namespace metaekf::meta {
@@ -271,6 +272,34 @@ TEST(TrainTest, CurvatureRatesBeginAtTheScaleOfTheLoss) {
   }
 }
 
+// L tensors step at 1/(L λ) each, for together they are as steep as the sum of their curvatures at most.
+TEST(TrainTest, CurvatureRatesLeaveRoomForEachOther) {
+  TrainingSpec spec = SmallSpec();
+  spec.inner_loop.learned_rates = spec.inner_loop.curvature_rates = spec.contexts_at_start = true;
+  spec.inner_loop.learning_rate = 0.5;
+  spec.outer_lr = spec.final_outer_lr = 0;
+  spec.warmup_iterations = 0;
+  spec.iterations = 1;
+  spec.validation_share = 0;
+  const Dataset fleet = Fleet(1, 80, 1);
+  const nssm::Bundle bundle = *Train(spec, fleet, nullptr, base::CallingThread(), nullptr);
+  const TrainingSpec trained = *ReadTrainingSpec(bundle.training);
+  const nssm::LossShape shape = *nssm::ShapeOfLoss(trained.model, trained.loss, spec.context_samples);
+  const MetaGradient<double> gradient(bundle.model, trained, shape, shape,
+                                      *nn::ParseMask(spec.inner_loop.adapted_mask, bundle.model.layout()));
+  MetaGradient<double>::Scratch scratch(gradient);
+  const nssm::LossData<double> context = nssm::CutLossData<double>(
+      trained.model, trained.loss, *data::Normalised(bundle.normaliser, fleet.trajectories[0]), 0, shape);
+  const std::vector<double> curvatures = gradient.Curvatures(bundle.parameters.data(), context, &scratch);
+  ASSERT_EQ(curvatures.size(), 4u);
+  size_t l = 0;
+  for (const nn::Tensor& tensor : bundle.model.layout().tensors()) {
+    const auto rate = trained.inner_loop.tensor_rates.find(tensor.name);
+    if (rate == trained.inner_loop.tensor_rates.end()) continue;  // it does not adapt
+    EXPECT_NEAR(rate->second * 4 * curvatures[l++], 0.5, 1e-9) << tensor.name;
+  }
+}
+
 /// Parameters after so many iterations.
 std::vector<double> ParametersAfter(const TrainingSpec& spec, int32_t iterations) {
   std::vector<double> parameters;
@@ -310,6 +339,27 @@ TEST(TrainTest, RolloutsGrowByDoubling) {
               state_after(with_horizon(horizon), &before, iteration + 1).values.at("parameters"))
         << iteration;
   }
+}
+
+// Of whole sets of 40 and 30 samples: rollouts of 2, 4, 8, 16 samples, one after the other, then the sets themselves.
+TEST(TrainTest, RolloutsGrowToWholeSets) {
+  TrainingSpec growing = SmallSpec();
+  growing.loss.horizon = nssm::LossSpec::kWholeSet;
+  growing.target_samples = 30;
+  growing.warmup_horizon = 2;
+  growing.horizon_growth_iterations = 10;
+  const auto with_horizon = [&](int32_t horizon, int32_t stride) {
+    TrainingSpec constant = growing;
+    constant.loss.horizon = horizon;
+    constant.loss.stride = stride;
+    constant.horizon_growth_iterations = 0;
+    return constant;
+  };
+  EXPECT_EQ(ParametersAfter(growing, 12), ParametersAfter(with_horizon(2, 2), 12));
+  EXPECT_NE(ParametersAfter(growing, 14), ParametersAfter(with_horizon(2, 2), 14));
+  growing.iterations = 21;
+  const absl::StatusOr<nssm::Bundle> bundle = Train(growing, Fleet(10, 80, 1), nullptr, base::CallingThread(), nullptr);
+  EXPECT_TRUE(bundle.ok()) << bundle.status();
 }
 
 // Only the first samples of a recording tell systems apart, so contexts from anywhere else teach nothing.

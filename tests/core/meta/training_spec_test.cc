@@ -92,6 +92,7 @@ TEST(TrainingSpecTest, WhatAnAlgorithmCannotUseIsRefusedByName) {
   expect_refused({{"iterations", 100}, {"warmup_iterations", 60}, {"horizon_growth_iterations", 40}}, "horizon_growth_iterations");
   expect_refused({{"algorithm", "GAUSSIAN_PRIOR"}, {"horizon_growth_iterations", 10}}, "horizon_growth_iterations");
   const json by_curvature = {{"curvature_rates", true}, {"learned_rates", true}};
+  expect_refused({{"inner_loop", by_curvature}, {"iterations", 10}, {"warmup_iterations", 10}}, "warmup_iterations");
   expect_refused({{"inner_loop", by_curvature}, {"restarts", 2}, {"screening_iterations", 10}, {"warmup_iterations", 10}},
                  "screening_iterations");
   expect_refused({{"restarts", 2}}, "screening_iterations");
