@@ -226,7 +226,13 @@ class Learner {
     const StructuredCovariance structured =
         FitStructure(options_, plan_.dynamics.adapted(), covariance.topLeftCorner(adapted, adapted));
     covariance.topLeftCorner(adapted, adapted) = structured.covariance;
-    if (options_.covariance == PriorCovariance::kManifold) population->loadings = structured.loadings;
+    if (options_.covariance == PriorCovariance::kManifold) {
+      if (structured.loadings.cols() == 0) {
+        return absl::OutOfRangeError("gaussian_prior.covariance: the systems have no direction in common to differ along, so there "
+                                     "is no MANIFOLD; FULL or BLOCK suits them");
+      }
+      population->loadings = structured.loadings;
+    }
     Belief& belief = population->belief;
     belief.mean = mean;
     const std::optional<MatrixXd> precision = InverseOf(covariance);

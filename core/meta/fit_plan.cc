@@ -80,19 +80,21 @@ Belief FitPlan::BeliefOf(const GaussianPrior& prior, const std::vector<double>& 
 
 namespace {
 
-/// [V 0; 0 I]: what may vary under a prior with loadings; else empty.
-MatrixXd DirectionsOf(const GaussianPrior& prior) {
-  if (prior.loadings.size() == 0) return {};
+/// What may vary under a prior with loadings: z ~ N(0, I) and the start.
+std::optional<Directions> DirectionsOf(const GaussianPrior& prior) {
+  if (prior.loadings.size() == 0) return std::nullopt;
   const Index p = prior.loadings.rows(), k = prior.loadings.cols(), n = prior.start.rows();
-  MatrixXd directions = MatrixXd::Zero(p + n, k + n);
-  directions.topLeftCorner(p, k) = prior.loadings;
-  directions.bottomRightCorner(n, n).setIdentity();
+  Directions directions{MatrixXd::Zero(p + n, k + n), MatrixXd::Identity(k + n, k + n)};
+  directions.basis.topLeftCorner(p, k) = prior.loadings;
+  directions.basis.bottomRightCorner(n, n).setIdentity();
+  directions.precision.bottomRightCorner(n, n) = prior.start;
   return directions;
 }
 
 /// The mean and those examples that are the most probable, each with a start c₀ fitted to the first samples.
 absl::StatusOr<std::vector<Candidate>> Screen(const FitPlan& plan, const GaussianPrior& prior, const std::vector<double>& mean,
-                                              const Belief& belief, const MatrixXd& directions, const Trajectory& normalised) {
+                                              const Belief& belief, const std::optional<Directions>& directions,
+                                              const Trajectory& normalised) {
   METAEKF_ASSIGN_OR_RETURN(const Trajectory head,
                            data::FirstSamples(normalised, std::min(normalised.length(), kScreeningSamples)));
   const RolloutLeastSquares& screened = plan.start ? *plan.start : plan.dynamics;
@@ -106,7 +108,12 @@ absl::StatusOr<std::vector<Candidate>> Screen(const FitPlan& plan, const Gaussia
   for (Index i = -1; i < prior.examples.cols(); ++i) {
     Candidate candidate{.unknowns = belief.mean};
     if (i >= 0) candidate.unknowns.head(adapted) = prior.examples.col(i);
-    if (directions.size() > 0) candidate.unknowns = belief.mean + directions * CoordinatesNear(belief, directions, candidate.unknowns);
+    double penalty = Penalty(belief, candidate.unknowns, adapted);
+    if (directions) {
+      const VectorXd z = CoordinatesNear(belief, directions->basis, candidate.unknowns);
+      candidate.unknowns = belief.mean + directions->basis * z;
+      penalty = 0.5 * z.head(prior.loadings.cols()).squaredNorm();
+    }
     std::vector<double> parameters = mean;
     ScatterAdapted(plan.dynamics, candidate.unknowns, &parameters);
     if (plan.start) {
@@ -117,7 +124,7 @@ absl::StatusOr<std::vector<Candidate>> Screen(const FitPlan& plan, const Gaussia
     } else {
       candidate.cost = screened.Cost(parameters.data(), VectorXd(), weights, few, &workspace);
     }
-    candidate.cost += Penalty(belief, candidate.unknowns, adapted);
+    candidate.cost += penalty;
     if (!std::isfinite(candidate.cost)) continue;
     mean_simulates = mean_simulates || i < 0;
     candidates.push_back(std::move(candidate));
@@ -135,7 +142,7 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
                                     const OnFitStep& on_step) {
   METAEKF_RETURN_IF_ERROR(plan.CheckPrior(prior));
   const Belief belief = plan.BeliefOf(prior, mean);
-  const MatrixXd directions = DirectionsOf(prior);
+  const std::optional<Directions> directions = DirectionsOf(prior);
   METAEKF_ASSIGN_OR_RETURN(const LossData<double> data, plan.dynamics.Cut(normalised));
   std::vector<Candidate> candidates{{.unknowns = options.from, .damping = kContinuedDamping}};
   if (options.from.size() == 0) {
@@ -171,7 +178,7 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
                        .noise_samples = options.noise_samples,
                        .directions = directions},
                       workspace(0), tell);
-  if (directions.size() > 0) {
+  if (directions) {
     result.fit.unknowns.head(prior.loadings.rows()) =
         nssm::AlongLoadings(prior, belief.mean.head(prior.loadings.rows()), result.fit.coordinates.head(prior.loadings.cols()));
   }

@@ -57,6 +57,21 @@ Objective Along(const MatrixXd& directions, const VectorXd& mean, const Objectiv
           }};
 }
 
+/// The same objective under x ~ N(mean, precision⁻¹), whose residuals are straight: they do not bend it.
+Objective Believed(const Objective& objective, const VectorXd& mean, const MatrixXd& precision) {
+  const auto pulled = [&mean, &precision](const VectorXd& x) { return VectorXd(precision * (x - mean)); };
+  return {.cost = [&objective, &mean, pulled](const VectorXd& x) { return objective.cost(x) + 0.5 * (x - mean).dot(pulled(x)); },
+          .linearise =
+              [&objective, &mean, &precision, pulled](const VectorXd& x, QuadraticModel* model) {
+                objective.linearise(x, model);
+                const VectorXd pull = pulled(x);
+                model->cost += 0.5 * (x - mean).dot(pull);
+                model->gradient += pull;
+                model->curvature += precision;
+              },
+          .bend = objective.bend};
+}
+
 }  // namespace
 
 VectorXd CoordinatesNear(const Belief& belief, const MatrixXd& directions, const VectorXd& x) {
@@ -92,44 +107,37 @@ MapFit FitMap(const RolloutLeastSquares& problem, const LossData<double>& data, 
     ScatterAdapted(problem, x, &all);
     if (x.size() > problem.adapted_size()) start = x.tail(problem.carry_size());
   };
-  const auto penalty = [&](const VectorXd& x) {
-    const VectorXd d = x - belief.mean;
-    return 0.5 * d.dot(belief.precision.selfadjointView<Eigen::Lower>() * d);
-  };
   NormalEquations equations;
-  Objective objective;  // linearised where the fit stands, and nowhere else
-  objective.cost = [&](const VectorXd& x) {
+  Objective of_data;  // linearised where the fit stands, and nowhere else
+  of_data.cost = [&](const VectorXd& x) {
     place(x);
-    return problem.Cost(all.data(), start, weights, data, workspace) + penalty(x);
+    return problem.Cost(all.data(), start, weights, data, workspace);
   };
-  objective.linearise = [&](const VectorXd& x, QuadraticModel* model) {
+  of_data.linearise = [&](const VectorXd& x, QuadraticModel* model) {
     place(x);
     problem.Linearise(all.data(), start, weights, data, workspace, &equations);
-    model->cost = equations.cost + penalty(x);
-    model->gradient = equations.gradient + belief.precision.selfadjointView<Eigen::Lower>() * (x - belief.mean);
-    model->curvature = equations.curvature + belief.precision;
+    *model = {.cost = equations.cost, .gradient = equations.gradient, .curvature = equations.curvature};
   };
-  objective.bend = [&](const VectorXd& x, const VectorXd& direction, double h) {  // the prior's residuals are straight
+  of_data.bend = [&](const VectorXd& x, const VectorXd& direction, double h) {
     place(x + h * direction);
     return problem.Bend(all.data(), start, h, direction, weights, data, workspace);
   };
-  const bool all_free = options.directions.size() == 0;
-  const MatrixXd& directions = options.directions;
-  MatrixXd precision = belief.precision.selfadjointView<Eigen::Lower>();
-  if (!all_free) precision = directions.transpose() * (precision * directions);
-  const Objective along = Along(directions, belief.mean, objective);
-  const OnIteration tell = [&](int iteration, double cost, const VectorXd& z) {
-    return on_iteration(iteration, cost, all_free ? z : VectorXd(belief.mean + directions * z));
-  };
+  const std::optional<Directions>& directions = options.directions;
+  const VectorXd mean = directions ? VectorXd::Zero(directions->basis.cols()) : belief.mean;
+  const MatrixXd precision = (directions ? directions->precision : belief.precision).selfadjointView<Eigen::Lower>();
+  const Objective along = directions ? Along(directions->basis, belief.mean, of_data) : of_data;
+  const Objective objective = Believed(along, mean, precision);
+  const auto unknowns_at = [&](const VectorXd& x) { return directions ? VectorXd(belief.mean + directions->basis * x) : x; };
+  const OnIteration tell = [&](int iteration, double cost, const VectorXd& x) { return on_iteration(iteration, cost, unknowns_at(x)); };
+  VectorXd x = directions ? CoordinatesNear(belief, directions->basis, from) : from;
   MapFit fit{.unknowns = from, .noise_variance = belief.noise_variance};
-  if (!all_free) fit.coordinates = CoordinatesNear(belief, directions, from);
   LevenbergMarquardtOptions optimiser = options.optimiser;
   for (int round = 0; round < kNoiseRounds; ++round) {
-    const LevenbergMarquardtResult result = MinimiseLevenbergMarquardt(
-        all_free ? objective : along, all_free ? fit.unknowns : fit.coordinates, optimiser, on_iteration ? tell : OnIteration());
+    const LevenbergMarquardtResult result = MinimiseLevenbergMarquardt(objective, x, optimiser, on_iteration ? tell : OnIteration());
     optimiser.initial_damping = fit.damping = result.damping;
-    (all_free ? fit.unknowns : fit.coordinates) = result.x;
-    if (!all_free) fit.unknowns = belief.mean + directions * fit.coordinates;
+    x = result.x;
+    fit.unknowns = unknowns_at(x);
+    if (directions) fit.coordinates = x;
     fit.information = result.model.curvature.selfadjointView<Eigen::Lower>();
     fit.channel_squares = equations.channel_squares;
     fit.cost = result.model.cost;

@@ -2,6 +2,7 @@
 
 #include <Eigen/Core>
 #include <functional>
+#include <optional>
 #include <vector>
 
 #include "core/meta/levenberg_marquardt.h"
@@ -25,25 +26,31 @@ struct MapFit {
   Eigen::MatrixXd information;
   Eigen::VectorXd noise_variance;  ///< as estimated from the residuals, with the belief's worth `noise_samples` samples
   Eigen::VectorXd channel_squares; ///< Σ r² of every channel
-  double cost = 0;                 ///< ½ Σ w r² + ½ (θ − m)ᵀ Λ (θ − m)
+  double cost = 0;                 ///< what was minimised
   int iterations = 0;
   double damping = 0;  ///< for a fit that goes on from here
   bool converged = false;
   bool stopped = false;
 };
 
+/// A plane that the unknowns lie in: m + B z with z ~ N(0, Λ_z⁻¹).
+struct Directions {
+  Eigen::MatrixXd basis;      ///< B, n × k, of full rank
+  Eigen::MatrixXd precision;  ///< Λ_z, k × k, symmetric: what is believed of z, instead of the belief's Λ
+};
+
 struct MapFitOptions {
   LevenbergMarquardtOptions optimiser;
   /// How many samples' worth of evidence the belief's noise variance counts for; infinite: it is not estimated.
   double noise_samples = std::numeric_limits<double>::infinity();
-  /// B, n × k, of full rank: the unknowns are m + B z, and z is free. Empty: all of them are.
-  Eigen::MatrixXd directions;
+  /// Nothing: all unknowns are free.
+  std::optional<Directions> directions;
 };
 
 /// z of the m + B z that is the most probable of all near x: the least (x − m − B z)ᵀ Λ (x − m − B z).
 Eigen::VectorXd CoordinatesNear(const Belief& belief, const Eigen::MatrixXd& directions, const Eigen::VectorXd& x);
 
-/// Minimises ½ Σ_c Σ r_c²/σ_c² + ½ (θ − m)ᵀ Λ (θ − m) over the unknowns θ.
+/// Minimises ½ Σ_c Σ r_c²/σ_c² + ½ (θ − m)ᵀ Λ (θ − m) over the unknowns θ; along directions, with ½ zᵀ Λ_z z instead.
 ///
 /// @param parameters  ω, of which the adapted part is not read.
 /// @param from        where to start; with directions at what is near it.

@@ -157,18 +157,18 @@ TEST(EmpiricalBayesTest, APriorOfTwoFactorsIsOneAndIsAdaptedUnder) {
 }
 
 TEST(EmpiricalBayesTest, APriorOfFactorsIsBitIdenticalWhateverTheThreadsAndResumed) {
-  const TrainingSpec spec = WithFactors(2);
-  const std::string whole = TrainedFile(1, nullptr, spec);
-  EXPECT_TRUE(TrainedFile(2, nullptr, spec) == whole);
-  base::Executor* const executor = base::CallingThread();
-  std::string checkpoint;
-  const absl::Status status = Train(spec, Resonators(12, 300, 1), nullptr, executor, [&](const TrainingProgress& p) {
-                                checkpoint = WriteCheckpoint(p.state, "digest");
-                                return p.state.iteration < 20;
-                              }).status();
-  EXPECT_EQ(status.code(), absl::StatusCode::kCancelled);
-  const TrainingState state = *ReadCheckpoint(checkpoint, "digest");
-  EXPECT_TRUE(TrainedFile(2, &state, spec) == whole);
+  for (const TrainingSpec& spec : {WithFactors(2), OnAManifold(4)}) {
+    const std::string whole = TrainedFile(3, nullptr, spec);
+    base::Executor* const executor = base::CallingThread();
+    std::string checkpoint;
+    const absl::Status status = Train(spec, Resonators(12, 300, 1), nullptr, executor, [&](const TrainingProgress& p) {
+                                  checkpoint = WriteCheckpoint(p.state, "digest");
+                                  return p.state.iteration < 20;
+                                }).status();
+    EXPECT_EQ(status.code(), absl::StatusCode::kCancelled);
+    const TrainingState state = *ReadCheckpoint(checkpoint, "digest");
+    EXPECT_TRUE(TrainedFile(2, &state, spec) == whole);
+  }
 }
 
 TEST(EmpiricalBayesTest, MoreFactorsThanParametersAreRefusedBeforeAnythingIsFitted) {
