@@ -106,13 +106,13 @@ json Protocol(const Options& options) {
 
 /// RMSE of both states over all 10 s, simulated from the first sample, so that shares compare; not a number where the model
 /// diverged.
-double Error(const absl::StatusOr<SystemModel>& model, const Trajectory& recording) {
-  const double failed = std::numeric_limits<double>::quiet_NaN();
-  if (!model.ok()) return failed;
-  const absl::StatusOr<Eigen::MatrixXd> free = PredictFreely(*model, recording, model->warmup);
-  if (!free.ok()) return failed;
-  const double error = std::sqrt((*free - recording.states.rightCols(free->cols())).array().square().mean());
-  return error < 1e3 ? error : failed;
+absl::StatusOr<double> Error(const absl::StatusOr<SystemModel>& model, const Trajectory& recording) {
+  constexpr double kFailed = std::numeric_limits<double>::quiet_NaN(), kDiverged = 1e3;
+  if (IsDivergence(model.status())) return kFailed;
+  METAEKF_RETURN_IF_ERROR(model.status());
+  METAEKF_ASSIGN_OR_RETURN(const Eigen::MatrixXd free, PredictFreely(*model, recording, model->warmup));
+  const double error = std::sqrt((free - recording.states.rightCols(free.cols())).array().square().mean());
+  return error < kDiverged ? error : kFailed;
 }
 
 /// A row each of `labels`.
@@ -126,14 +126,18 @@ Table ToTable(const std::vector<std::string>& labels, const std::vector<std::vec
   return table;
 }
 
-double MeanOf(const Table& table, size_t row, size_t column) { return Summarise(table.rows[row].cells[column], false).mean; }
+/// Mean over runs; infinite if one of them failed.
+double MeanOf(const Table& table, size_t row, size_t column) {
+  const Statistics s = Summarise(table.rows[row].cells[column], false);
+  return s.failed == 0 ? s.mean : std::numeric_limits<double>::infinity();
+}
 
 /// Index of the row with the least (or greatest) mean in a column, among the first rows.
 size_t Extreme(const Table& table, size_t rows, size_t column, bool least) {
   size_t extreme = 0;
   for (size_t row = 1; row < rows; ++row) {
     const double value = MeanOf(table, row, column), so_far = MeanOf(table, extreme, column);
-    if (!std::isfinite(so_far) || (least ? value < so_far : value > so_far)) extreme = row;
+    if (least ? value < so_far : value > so_far) extreme = row;
   }
   return extreme;
 }
@@ -160,7 +164,7 @@ std::vector<std::string> Findings(const Table& table, size_t learners) {
 }
 
 absl::StatusOr<Picture> Draw(const Table& table) {
-  plot::HeatMap map{.title = "RMSE in a free run of 10 s, mean over runs", .x_label = "share of the target's data adapted to",
+  plot::HeatMap map{.title = "RMSE in a free run of 10 s, mean over runs; empty where one failed", .x_label = "share of the target's data adapted to",
                     .values = Eigen::MatrixXd(table.rows.size(), table.columns.size()), .logarithmic = true};
   for (const Column& column : table.columns) map.columns.push_back(column.name);
   for (size_t row = 0; row < table.rows.size(); ++row) {
@@ -197,9 +201,11 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
     const double begin = ThreadSeconds();
     const absl::StatusOr<nssm::Bundle> bundle = TrainLearner(learners[i], fleet.dataset, {}, kFirstSeed + run, serial);
     seconds[i][run] = ThreadSeconds() - begin;
-    if (absl::IsOutOfRange(bundle.status())) return absl::OkStatus();  // diverged: this run has failed, no more
+    if (IsDivergence(bundle.status())) return absl::OkStatus();
     METAEKF_RETURN_IF_ERROR(bundle.status());
-    for (size_t k = 0; k < shares; ++k) errors[i][k][run] = Error(AdaptToContext(*bundle, contexts[k]), recording);
+    for (size_t k = 0; k < shares; ++k) {
+      METAEKF_ASSIGN_OR_RETURN(errors[i][k][run], Error(AdaptToContext(*bundle, contexts[k]), recording));
+    }
     return absl::OkStatus();
   });
   METAEKF_RETURN_IF_ERROR(studied);
@@ -208,7 +214,10 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
   const ClassicalModel arx = Arx(kArxOrder);
   labels.push_back(arx.label);
   errors.emplace_back();
-  for (const Trajectory& context : contexts) errors.back().push_back({Error(arx.fit(context), recording)});
+  for (const Trajectory& context : contexts) {
+    METAEKF_ASSIGN_OR_RETURN(const double error, Error(arx.fit(context), recording));
+    errors.back().push_back({error});
+  }
   Table table = ToTable(labels, errors, scale.runs);
   Table times{.name = "times", .title = "Processor time", .row_heading = "learner", .columns = {{"training", "s"}}};
   for (size_t i = 0; i < learners.size(); ++i) times.rows.push_back({learners[i].label, {seconds[i]}});

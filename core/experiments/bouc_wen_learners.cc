@@ -7,6 +7,8 @@
 #include "core/base/status.h"
 #include "core/experiments/jobs.h"
 #include "core/meta/adapt.h"
+#include "core/meta/fit_plan.h"
+#include "core/meta/scratch_fit.h"
 
 namespace metaekf::experiments {
 namespace {
@@ -117,21 +119,36 @@ std::vector<Learner> BoucWenLearners(Budget budget) {
   return learners;
 }
 
-absl::StatusOr<SystemModel> FitFromScratch(const absl::StatusOr<nssm::Bundle>& like, const data::Trajectory& context, uint64_t seed) {
-  METAEKF_RETURN_IF_ERROR(like.status());
-  const nssm::Bundle& bundle = *like;
+absl::StatusOr<SystemModel> FitFromScratch(const Learner& like, const data::Trajectory& context, uint64_t seed) {
+  METAEKF_ASSIGN_OR_RETURN(meta::TrainingSpec spec, meta::ReadTrainingSpec(like.specification));
+  spec.model.input_size = spec.model.output_size = 1;
+  spec.model.state_size = 0;
+  METAEKF_ASSIGN_OR_RETURN(nssm::Model model, nssm::Model::Create(spec.model));
+  const data::Dataset alone{.input_names = {"u1"}, .output_names = {"y1"}, .trajectories = {context}};
+  METAEKF_ASSIGN_OR_RETURN(const data::Normaliser normaliser, data::FitNormaliser(alone, {}));
+  nssm::Bundle bundle{.model = std::move(model), .normaliser = normaliser, .sample_period_s = context.sample_period_s,
+                      .names = {alone.input_names, alone.output_names, {}}, .training = meta::ToJson(spec)};
+  if (spec.model.fits_start()) {
+    METAEKF_ASSIGN_OR_RETURN(const data::Trajectory normalised, data::Normalised(normaliser, context));
+    const meta::FitPlan plan(bundle.model, spec.loss, nn::Mask(bundle.model.layout().tensors().size(), true));
+    METAEKF_ASSIGN_OR_RETURN(meta::SystemFit fit,
+                             meta::FitFromScratch(plan, bundle.model, spec.loss, normalised,
+                                                  {.seed = seed, .steps = spec.adaptation.steps, .stop_early = true}, nullptr));
+    bundle.parameters = std::move(fit.parameters);
+    const Eigen::Index latents = spec.model.latent_size;  // of the order of one; where they begin is not known
+    bundle.prior = nssm::GaussianPrior{.start = Eigen::MatrixXd::Identity(latents, latents),
+                                       .start_guess = Eigen::MatrixXd::Zero(latents, bundle.model.start_size() + 1),
+                                       .noise_variance = fit.fit.noise_variance};
+    return ModelOf(bundle);
+  }
+  bundle.parameters = bundle.model.InitialParameters(seed);
   METAEKF_ASSIGN_OR_RETURN(meta::AdaptationOptions options,
                            meta::DefaultAdaptation(bundle, meta::AdaptationMethod::kFromScratch));
   options.seed = seed;
   options.inner_loop.steps = std::min(options.inner_loop.steps, kScratchSteps);
-  nssm::Bundle fitted = bundle;
-  if (bundle.model.spec().fits_start()) {  // holds a tail out by itself
-    METAEKF_ASSIGN_OR_RETURN(fitted.parameters, meta::AdaptedParameters(bundle, context, options));
-  } else {
-    METAEKF_ASSIGN_OR_RETURN(meta::AdaptationResult result, meta::Adapt(bundle, context, options, nullptr));
-    fitted.parameters = std::move(result.parameters);
-  }
-  return ModelOf(fitted);
+  METAEKF_ASSIGN_OR_RETURN(meta::AdaptationResult result, meta::Adapt(bundle, context, options, nullptr));
+  bundle.parameters = std::move(result.parameters);
+  return ModelOf(bundle);
 }
 
 absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learners, const data::Dataset& fleet,
@@ -150,7 +167,7 @@ absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learn
         TrainLearner(learner, fleet, context, seed, executor, [&tell](const meta::TrainingProgress& step) {
           return tell(step.state.iteration, step.iterations);
         });
-    if (!bundle.ok() && !absl::IsOutOfRange(bundle.status())) return bundle.status();
+    if (!bundle.ok() && !IsDivergence(bundle.status())) return bundle.status();
     const double seconds = std::chrono::duration<double>(Clock::now() - begin).count();
     trainings.push_back({std::move(bundle), seconds, memory.MiB()});
   }

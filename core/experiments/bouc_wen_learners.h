@@ -17,9 +17,11 @@ std::vector<Learner> BoucWenLearners(Budget budget);
 Learner PrintedMaml(Budget budget);
 
 /// A model that knows nothing but the context, fitted as `metaekf adapt --method from-scratch` does it: exactly (label
-/// kFromScratchLabel) where the start is fitted, else by gradient steps (kByGradientsLabel), both stopped early. Architecture
-/// and normaliser are those of `like`. Errors: those of meta::Adapt, and that of `like`.
-absl::StatusOr<SystemModel> FitFromScratch(const absl::StatusOr<nssm::Bundle>& like, const data::Trajectory& context, uint64_t seed);
+/// kFromScratchLabel) where the start is fitted, else by gradient steps (kByGradientsLabel), both stopped early.
+///
+/// @param like  the learner whose architecture and loss it has.
+/// Errors: those of meta::FitFromScratch or meta::Adapt.
+absl::StatusOr<SystemModel> FitFromScratch(const Learner& like, const data::Trajectory& context, uint64_t seed);
 
 /// What a training has brought, and what it took.
 struct Training {

@@ -96,7 +96,7 @@ json Protocol(const Options& options) {
 /// How good one model is after one length of context; nothing measured where it needs more.
 struct Outcome {
   bool measured = false;
-  double one_step_rmse = kNan, one_step_fit = kNan, free_rmse = kNan, free_fit = kNan, seconds = 0, memory_mib = kNan;
+  double one_step_rmse = kNan, one_step_fit = kNan, free_rmse = kNan, free_fit = kNan, seconds = kNan, memory_mib = kNan;
   MatrixXd free;  // of the first test
 };
 
@@ -174,9 +174,11 @@ absl::Status JudgeAll(const std::vector<std::pair<size_t, Fit>>& models, const S
     if (alone) memory.emplace();
     const double begin = ThreadSeconds();
     fitted[place] = models[model].second(context);
+    const bool too_short = absl::IsFailedPrecondition(fitted[place].status());
+    outcomes[place].measured = !too_short;
+    if (!fitted[place].ok()) return too_short || IsDivergence(fitted[place].status()) ? absl::OkStatus() : fitted[place].status();
     outcomes[place].seconds = ThreadSeconds() - begin;
     if (memory) outcomes[place].memory_mib = memory->MiB();
-    outcomes[place].measured = !absl::IsFailedPrecondition(fitted[place].status());
     return absl::OkStatus();
   };
   METAEKF_RETURN_IF_ERROR(RunJobs(models.size() * (lengths - 1), executor, "models adapted", on_progress,
@@ -212,12 +214,11 @@ absl::Status RunOnce(const Options& options, const Scale& scale, uint64_t run, b
         return AdaptToContext(*bundle, context);
       });
     }
-    if (kind.excitation != BoucWenExcitation::kMultisine) continue;
-    for (const auto& [label, model] : {std::pair{kFromScratchLabel, 0}, {kByGradientsLabel, 1}}) {
-      models.emplace_back(results->IndexOf(label), [bundle = trainings[static_cast<size_t>(model)].bundle, run](const Trajectory& context) {
-        return FitFromScratch(bundle, context, kFirstSeed + run);
-      });
-    }
+  }
+  for (const auto& [label, like] : {std::pair{kFromScratchLabel, 0}, {kByGradientsLabel, 1}}) {
+    models.emplace_back(results->IndexOf(label), [learner = learners[static_cast<size_t>(like)], run](const Trajectory& context) {
+      return FitFromScratch(learner, context, kFirstSeed + run);
+    });
   }
   for (const ClassicalModel& model : ClassicalModels()) models.emplace_back(results->IndexOf(model.label), model.fit);
   return JudgeAll(models, scale, target, executor, on_progress, results);
@@ -257,18 +258,17 @@ Table Times(const Results& results, const Scale& scale) {
   return table;
 }
 
+/// Mean over runs; infinite if one of them failed.
+double MeanUnlessFailed(const std::vector<double>& runs) {
+  const Statistics s = Summarise(runs, false);
+  return s.runs > 0 && s.failed == 0 ? s.mean : std::numeric_limits<double>::infinity();
+}
+
 /// The model with the least mean error in free run after the longest context.
-size_t BestModel(const Results& results) {
-  size_t best = 0;
-  double least = std::numeric_limits<double>::infinity();
-  for (size_t i = 0; i < results.labels.size(); ++i) {
-    const double rmse = results.outcomes[i][0].back().free_rmse;
-    if (rmse < least) {
-      least = rmse;
-      best = i;
-    }
-  }
-  return best;
+size_t BestModel(const Table& rmse) {
+  const auto mean = [](const Row& row) { return MeanUnlessFailed(row.cells.back()); };
+  return static_cast<size_t>(std::min_element(rmse.rows.begin(), rmse.rows.end(), [&](const Row& a, const Row& b) { return mean(a) < mean(b); }) -
+                             rmse.rows.begin());
 }
 
 /// "Gaussian prior: 2e-05 m from the multisine fleet, 4e-05 m from the sine fleet": mean errors in free run of two rows.
@@ -276,7 +276,7 @@ std::string Compare(const Table& rmse, size_t column, const std::string& what, c
                     const std::string& other_row, const std::string& of_other_row) {
   const auto mean = [&](const std::string& label) {
     const auto place = std::find_if(rmse.rows.begin(), rmse.rows.end(), [&label](const Row& one) { return one.label == label; });
-    const double value = place == rmse.rows.end() ? kNan : Summarise(place->cells[column], false).mean;
+    const double value = place == rmse.rows.end() ? kNan : MeanUnlessFailed(place->cells[column]);
     return std::isfinite(value) ? base::FormatShort(value, 3) + " m" : std::string("failed");
   };
   return absl::StrCat(what, ": ", mean(row), " ", of_row, ", ", mean(other_row), " ", of_other_row);
@@ -330,9 +330,12 @@ absl::StatusOr<Picture> DrawErrors(const Results& results, size_t best, const Tr
   for (const std::string& label : labels) {
     const auto place = std::find(results.labels.begin(), results.labels.end(), label);
     if (place == results.labels.end()) continue;
-    const MatrixXd& free = results.outcomes[static_cast<size_t>(place - results.labels.begin())][0].back().free;
-    plot::Box box{.label = label};
-    for (Eigen::Index t = 0; t < free.cols(); ++t) box.values.push_back(1e3 * (free(0, t) - test.outputs(0, t + kScoredFrom)));
+    const Outcome& outcome = results.outcomes[static_cast<size_t>(place - results.labels.begin())][0].back();
+    const bool failed = !std::isfinite(outcome.free_rmse);
+    plot::Box box{.label = failed ? label + " (failed)" : label};
+    for (Eigen::Index t = 0; t < outcome.free.cols() && !failed; ++t) {
+      box.values.push_back(1e3 * (outcome.free(0, t) - test.outputs(0, t + kScoredFrom)));
+    }
     picture.boxes.push_back(std::move(box));
   }
   METAEKF_ASSIGN_OR_RETURN(std::string svg, plot::RenderSvg(picture));
@@ -381,9 +384,9 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
       "Tests are multisines of the nominal system with fresh phases, without noise; mean ± standard deviation over runs.",
       "From scratch with 20 and 80 % of the signal, 8192 and 32768 samples: the paper's Sup/Tr20 and Sup/Tr80.",
       "Univ is trained with the longest context. The printed network has a fraction of the paper's 10,000 epochs: not converged."};
-  const size_t best = BestModel(results);
+  const size_t best = BestModel(report.tables[0]);
   report.findings = {absl::StrCat("Best in free run after ", scale.lengths.back(), " samples: ", results.labels[best], " with ",
-                                  base::FormatShort(results.outcomes[best][0].back().free_rmse, 3), " m.")};
+                                  base::FormatShort(Summarise(report.tables[0].rows[best].cells.back(), false).mean, 3), " m.")};
   for (std::string& finding : Findings(report.tables[0], PrintedMaml(options.budget).label)) {
     report.findings.push_back(std::move(finding));
   }

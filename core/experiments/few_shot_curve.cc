@@ -80,14 +80,14 @@ json Protocol(const Options& options) {
 }
 
 /// Fit in free run of one model of one target; nothing where there is no such model of so few samples.
-std::vector<double> Judge(const absl::StatusOr<SystemModel>& model, const Trajectory& test) {
-  if (absl::IsFailedPrecondition(model.status())) return {};
-  if (!model.ok()) return {kNan};
-  const absl::StatusOr<Eigen::MatrixXd> free = PredictFreely(*model, test, kScoredFrom);
-  if (!free.ok()) return {kNan};
-  const Eigen::MatrixXd truth = test.outputs.rightCols(free->cols());
-  const double fit = nssm::ScorePredictions({truth}, {*free}).fit_percent[0];
-  return {fit > kFailedFit ? fit : kNan};
+absl::StatusOr<std::vector<double>> Judge(const absl::StatusOr<SystemModel>& model, const Trajectory& test) {
+  if (absl::IsFailedPrecondition(model.status())) return std::vector<double>();
+  if (IsDivergence(model.status())) return std::vector<double>{kNan};
+  METAEKF_RETURN_IF_ERROR(model.status());
+  METAEKF_ASSIGN_OR_RETURN(const Eigen::MatrixXd free, PredictFreely(*model, test, kScoredFrom));
+  const Eigen::MatrixXd truth = test.outputs.rightCols(free.cols());
+  const double fit = nssm::ScorePredictions({truth}, {free}).fit_percent[0];
+  return std::vector<double>{fit > kFailedFit ? fit : kNan};
 }
 
 struct Study {
@@ -111,7 +111,7 @@ struct Study {
       METAEKF_RETURN_IF_ERROR(trainings[model].bundle.status());
       return AdaptToContext(*trainings[model].bundle, context);
     }
-    if (model == learners.size()) return FitFromScratch(trainings[0].bundle, context, kFirstSeed);
+    if (model == learners.size()) return FitFromScratch(learners[0], context, kFirstSeed);
     return classical[model - learners.size() - 1].fit(context);
   }
 };
@@ -216,7 +216,7 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
     for (size_t i = 0; i < study.scale.lengths.size(); ++i) {
       METAEKF_ASSIGN_OR_RETURN(const Trajectory context,
                                data::FirstSamples(study.targets.contexts[target], study.scale.lengths[i]));
-      fits[model][i][target] = Judge(study.Fit(model, context), study.targets.tests[target]);
+      METAEKF_ASSIGN_OR_RETURN(fits[model][i][target], Judge(study.Fit(model, context), study.targets.tests[target]));
     }
     adaptation_s[model][target] = ThreadSeconds() - begin;
     return absl::OkStatus();

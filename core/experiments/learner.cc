@@ -43,10 +43,6 @@ nlohmann::json ToJson(const Learner& learner) {
   return {{"label", learner.label}, {"trained_on", NameOf(learner.data)}, {"specification", learner.specification}};
 }
 
-absl::Status CheckLearner(const Learner& learner) {
-  return base::Annotate(meta::ReadTrainingSpec(learner.specification).status(), learner.label);
-}
-
 absl::StatusOr<nssm::Bundle> TrainLearner(const Learner& learner, const data::Dataset& fleet, const Trajectory& context,
                                           uint64_t seed, base::Executor* executor, const meta::OnTrainingStep& on_step) {
   nlohmann::json specification = learner.specification;
@@ -71,6 +67,8 @@ SystemModel ModelOf(const nssm::Bundle& bundle) {
   };
   return {.warmup = bundle.model.spec().warmup(), .predict = predict};
 }
+
+bool IsDivergence(const absl::Status& status) { return absl::IsOutOfRange(status); }
 
 absl::StatusOr<SystemModel> AdaptToContext(const nssm::Bundle& bundle, const Trajectory& context) {
   METAEKF_ASSIGN_OR_RETURN(const meta::AdaptationOptions options, meta::DefaultAdaptation(bundle));

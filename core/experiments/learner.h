@@ -25,9 +25,6 @@ struct Learner {
 
 nlohmann::json ToJson(const Learner& learner);
 
-/// Whether this build knows what the specification asks for (its algorithm, say). Errors: InvalidArgument with the field.
-absl::Status CheckLearner(const Learner& learner);
-
 /// @param context  of the target system; used unless the learner trains on the fleet alone.
 /// Errors: those of meta::Train, beginning with the label.
 absl::StatusOr<nssm::Bundle> TrainLearner(const Learner& learner, const data::Dataset& fleet, const data::Trajectory& context,
@@ -42,6 +39,9 @@ struct SystemModel {
 };
 
 SystemModel ModelOf(const nssm::Bundle& bundle);
+
+/// Whether a model has diverged, in training or adaptation: its run has failed, and no more. Other errors end a study.
+bool IsDivergence(const absl::Status& status);
 
 /// Adapts as the specification that the model was trained with says. Errors: those of meta::AdaptedParameters.
 absl::StatusOr<SystemModel> AdaptToContext(const nssm::Bundle& bundle, const data::Trajectory& context);

@@ -148,7 +148,7 @@ json Protocol(const Options& options) {
 /// What one model of one run has achieved. Infinite where it diverged.
 struct Trial {
   double free_run = kInfinity, in_blocks = kInfinity, one_step = kInfinity;  // Σ (x − x̂)² over samples and components
-  double training_s = 0, adaptation_s = 0;
+  double training_s = std::numeric_limits<double>::quiet_NaN(), adaptation_s = std::numeric_limits<double>::quiet_NaN();
   MatrixXd free_states;
 };
 
@@ -168,9 +168,6 @@ absl::Status Judge(const SystemModel& model, const Trajectory& recording, Trial*
   trial->one_step = SquaredError(one_step.rightCols(truth.cols()), truth);
   return absl::OkStatus();
 }
-
-/// A model that diverged in training or adaptation has failed its run, and no more.
-bool IsDivergence(const absl::Status& status) { return absl::IsOutOfRange(status); }
 
 absl::StatusOr<Trial> RunTrial(const Scale& scale, uint64_t seed, size_t model_index) {
   base::Executor* const serial = base::CallingThread();
@@ -193,9 +190,9 @@ absl::StatusOr<Trial> RunTrial(const Scale& scale, uint64_t seed, size_t model_i
   const double trained = ThreadSeconds();
   trial.training_s = trained - begin;
   const absl::StatusOr<SystemModel> model = AdaptToContext(*bundle, context);
-  trial.adaptation_s = ThreadSeconds() - trained;
   if (IsDivergence(model.status())) return trial;
   METAEKF_RETURN_IF_ERROR(model.status());
+  trial.adaptation_s = ThreadSeconds() - trained;
   METAEKF_RETURN_IF_ERROR(Judge(*model, recording, &trial));
   return trial;
 }
@@ -289,8 +286,10 @@ std::vector<double> RowOf(const MatrixXd& matrix, Eigen::Index row) {
 absl::StatusOr<Picture> DrawDistribution(const Results& results) {
   plot::BoxPlot picture{.title = "Errors in free run, all runs", .x_label = "sum of squared errors", .logarithmic = true};
   for (const Variant& variant : kVariants) {
-    picture.boxes.push_back({.label = variant.label,
-                             .values = results.Values(results.IndexOf(variant.label), &Trial::free_run), .colour = variant.colour});
+    const std::vector<double> errors = results.Values(results.IndexOf(variant.label), &Trial::free_run);
+    const size_t failed = Summarise(errors, false).failed;
+    picture.boxes.push_back({.label = failed == 0 ? variant.label : absl::StrCat(variant.label, " (", failed, " failed)"),
+                             .values = errors, .colour = variant.colour});
   }
   METAEKF_ASSIGN_OR_RETURN(std::string svg, plot::RenderSvg(picture));
   return Picture{"error-distribution", std::move(svg)};

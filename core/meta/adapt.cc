@@ -243,7 +243,8 @@ absl::StatusOr<FitResult> FitAnyPrecision(const Bundle& bundle, const Problem& p
   if (options.method == AdaptationMethod::kLevenbergMarquardt && problem.trained_at_minimum) {
     return FitToMinimum(bundle, problem, normalised, options, on_step);
   }
-  if (options.method == AdaptationMethod::kLevenbergMarquardt || bundle.model.spec().fits_start()) {
+  const bool exactly_from_scratch = options.method == AdaptationMethod::kFromScratch && bundle.prior;
+  if (options.method == AdaptationMethod::kLevenbergMarquardt || exactly_from_scratch) {
     return FitByLevenbergMarquardt(bundle, problem, normalised, options, on_step);
   }
   return bundle.model.spec().precision == nssm::Precision::kFloat32
@@ -378,7 +379,7 @@ absl::StatusOr<AdaptationOptions> DefaultAdaptation(const Bundle& bundle, std::o
   const AdaptationMethod trained_for = MethodOf(options.inner_loop.optimiser);
   options.method = method.value_or(trained_for);
   if (options.method == AdaptationMethod::kFromScratch) {
-    if (!bundle.model.spec().fits_start()) options.inner_loop.steps *= kScratchSteps;
+    if (!bundle.prior) options.inner_loop.steps *= kScratchSteps;
     options.inner_loop.learning_rate = kScratchLearningRate;
     options.inner_loop.tensor_rates.clear();
     options.inner_loop.adapted_mask = "*";
