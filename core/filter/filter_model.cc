@@ -103,7 +103,7 @@ class TypedFilterModel : public FilterModel {
   }
 
   MatrixXd EncodedCovariance(const Scratch& scratch) const override {
-    return static_cast<const TypedScratch&>(scratch).start_fit->Covariance(0);
+    return static_cast<const TypedScratch&>(scratch).start_fit->Covariance();
   }
 
  private:

@@ -23,7 +23,7 @@ using Eigen::MatrixXd;
 enum Slot : int32_t { kParameters, kStart, kInputs, kNextInputs, kOutputsOut, kStatesOut, kCarryOut };
 
 constexpr Index kChunk = 4096;  // columns at a time: enough for wide products, little memory
-constexpr int32_t kFittedWindows = 64;  // side by side
+constexpr int32_t kFittedWindows = 32;  // side by side
 
 template <typename T>
 using MatrixT = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic>;

@@ -1,6 +1,7 @@
 #include "core/nssm/start_fit.h"
 
 #include <Eigen/Cholesky>
+#include <algorithm>
 #include <cmath>
 #include <limits>
 
@@ -10,7 +11,6 @@ namespace metaekf::nssm {
 
 using autodiff::Graph;
 using autodiff::kNoValue;
-using autodiff::Output;
 using autodiff::Value;
 using Eigen::Index;
 using Eigen::MatrixXd;
@@ -18,11 +18,14 @@ using Eigen::VectorXd;
 
 namespace {
 
-enum Slot : int32_t { kParameters, kCarry, kInput, kNextOut, kOutputOut, kByCarryNextOut, kByCarryOutputOut };
+enum Slot : int32_t { kParameters, kCarry, kTangents, kInput, kNextOut, kOutputOut, kNextTangentsOut, kOutputTangentsOut };
 
-constexpr int kPasses = 60;  // of one window, which takes 35 on average: the last digits come slowly along a curved valley
-constexpr double kFirstDamping = 1e-3, kDampingFactor = 10;
-constexpr double kConverged = 1e-6;  // relative change of the cost that a window stops at
+constexpr Index kStretch = 32;       // windows that follow each other in one place
+constexpr int kSteps = 60;           // from one start at most
+constexpr double kConverged = 0.1;   // decrease of ½ χ² that ends a fit: one-step errors are 0.7 % above those of the minimum
+constexpr double kSurprise = 10;     // of ½ χ² above the last window's, that asks for other starts
+constexpr double kFirstDamping = 1e-3;
+constexpr double kEasing = 1.0 / 3;  // of the damping after a step, at most
 
 }  // namespace
 
@@ -42,144 +45,56 @@ StartFit::StartFit(const Model& model, const GaussianPrior& prior, int32_t width
   const Value carry = graph.Input(kCarry, 0, n, width);
   const Value input = input_size_ > 0 ? graph.Input(kInput, 0, input_size_, width) : kNoValue;
   const Step step = BuildStep(model, RolloutMode::kLatent, parts, carry, input);
-  // Direction i is a block of columns that moves component i of every window's carry.
-  std::vector<double> directions(static_cast<size_t>(n * n * width), 0);
-  for (int32_t i = 0; i < n; ++i) {
-    for (int32_t j = 0; j < width; ++j) directions[static_cast<size_t>((i * width + j) * n + i)] = 1;
-  }
-  const Value seed = graph.ConstantData(std::move(directions), n, n * width);
-  std::vector<Value> tangents = autodiff::Jvp(&graph, {{carry, seed}}, {step.next, step.output}, n);
+  std::vector<Value> tangents =
+      autodiff::Jvp(&graph, {{carry, graph.Input(kTangents, 0, n, n * width)}}, {step.next, step.output}, n);
   const int32_t rows[] = {n, output_size_};
   for (size_t i = 0; i < 2; ++i) {
     if (tangents[i] == kNoValue) tangents[i] = graph.Constant(0, rows[i], n * width);
   }
   step_.emplace(autodiff::Compile(graph, {{step.next, kNextOut},
                                           {step.output, kOutputOut},
-                                          {tangents[0], kByCarryNextOut},
-                                          {tangents[1], kByCarryOutputOut}}));
+                                          {tangents[0], kNextTangentsOut},
+                                          {tangents[1], kOutputTangentsOut}}));
   arena_.emplace(std::initializer_list<const autodiff::Executable<double>*>{&*step_});
-  const Point point{VectorXd::Zero(n), VectorXd::Zero(n), VectorXd::Zero(n), MatrixXd::Zero(n, n), MatrixXd::Zero(n, n), 0};
-  places_.assign(static_cast<size_t>(width), {.best = point, .trial = point});
-  carry_.setZero(n, width);
-  next_.setZero(n, width);
+  const VectorXd zero = VectorXd::Zero(n);
+  const Point point{zero, zero, zero, zero, MatrixXd::Zero(n, n), MatrixXd::Zero(n, n), 0};
+  places_.assign(static_cast<size_t>(width), {.best = point, .trial = point, .fitted = point});
+  for (MatrixXd* matrix : {&carry_, &next_, &second_}) matrix->setZero(n, width);
+  for (MatrixXd* matrix : {&tangents_, &next_tangents_}) matrix->setZero(n, n * width);
   input_.setZero(input_size_, width);
-  output_.setZero(output_size_, width);
-  by_carry_next_.setZero(n, n * width);
-  by_carry_output_.setZero(output_size_, n * width);
+  for (MatrixXd* matrix : {&output_, &measured_}) matrix->setZero(output_size_, width);
+  output_tangents_.setZero(output_size_, n * width);
+  for (Eigen::ArrayXXd* array : {&cost_, &residual_, &weighted_}) array->setZero(width, 1);
+  gradient_.setZero(width, n);
+  information_.setZero(width, n * (n + 1) / 2);
   damped_.setZero(n, n);
-  product_.setZero(n, n);
-  row_.setZero(n);
   step_vector_.setZero(n);
 }
 
-void StartFit::Begin(Place* place, Index window, const MatrixXd& windows) {
-  place->window = window;
-  place->passes = 0;
-  place->damping = kFirstDamping;
-  place->best.cost = std::numeric_limits<double>::infinity();
-  place->trial.start = guess_.col(windows.rows());
-  place->trial.start.noalias() += guess_.leftCols(windows.rows()).lazyProduct(windows.col(window));
-}
-
-void StartFit::Evaluate(const double* parameters, const MatrixXd& windows) {
-  const Index n = latent_size_, rows = input_size_ + output_size_;
-  autodiff::Slots<double> slots;
-  slots.Input(kParameters, parameters)
-      .Input(kCarry, carry_.data())
-      .Input(kInput, input_.data())
-      .Output(kNextOut, next_.data())
-      .Output(kOutputOut, output_.data())
-      .Output(kByCarryNextOut, by_carry_next_.data())
-      .Output(kByCarryOutputOut, by_carry_output_.data());
-  for (Index j = 0; j < width_; ++j) {
-    Place& place = places_[static_cast<size_t>(j)];
-    if (place.window == kNone) continue;
-    Point& p = place.trial;
-    carry_.col(j) = p.start;
-    p.sensitivity.setIdentity();
-    p.information = start_precision_;
-    p.gradient.noalias() = start_precision_.lazyProduct(p.start);
-    p.cost = 0.5 * p.start.dot(p.gradient);
-  }
-  for (Index k = 0; k + 1 < window_; ++k) {
-    for (Index j = 0; j < width_; ++j) {
-      const Index window = places_[static_cast<size_t>(j)].window;
-      if (window != kNone) input_.col(j) = windows.block((k + input_shift_) * rows, window, input_size_, 1);
-    }
-    autodiff::Evaluate(*step_, slots, *arena_);
-    for (Index j = 0; j < width_; ++j) {
-      Place& place = places_[static_cast<size_t>(j)];
-      if (place.window == kNone) continue;
-      Point& p = place.trial;
-      for (Index c = 0; c < output_size_; ++c) {
-        const double residual = output_(c, j) - windows((k + 1) * rows + input_size_ + c, place.window);
-        row_.setZero();
-        for (Index i = 0; i < n; ++i) row_ += by_carry_output_(c, i * width_ + j) * p.sensitivity.row(i).transpose();
-        p.cost += 0.5 * weights_[c] * residual * residual;
-        p.gradient += weights_[c] * residual * row_;
-        p.information.noalias() += weights_[c] * row_.lazyProduct(row_.transpose());
-      }
-      product_.setZero();
-      for (Index i = 0; i < n; ++i) {
-        product_.noalias() += by_carry_next_.col(i * width_ + j).lazyProduct(p.sensitivity.row(i));
-      }
-      p.sensitivity = product_;
-    }
-    carry_ = next_;
-  }
-  for (Index j = 0; j < width_; ++j) {
-    Point& p = places_[static_cast<size_t>(j)].trial;
-    p.end = carry_.col(j);
-    if (!std::isfinite(p.cost)) p.cost = std::numeric_limits<double>::infinity();
-  }
-}
-
-/// Keeps what is better. Whether the window is done.
-bool StartFit::Judge(Place* place) {
-  const double change = std::abs(place->best.cost - place->trial.cost);
-  const bool better = place->trial.cost < place->best.cost || place->passes == 0;
-  ++place->passes;
-  const bool is_step = place->passes > 2;  // the first two are the guess and the origin
-  const bool converged = is_step && std::isfinite(change) && change <= kConverged * place->best.cost;
-  if (better) std::swap(place->best, place->trial);
-  if (is_step) place->damping *= better ? 1 / kDampingFactor : kDampingFactor;
-  return converged || place->passes == kPasses;
-}
-
-void StartFit::Propose(Place* place) {
-  if (place->passes == 1) {
-    place->trial.start.setZero();
-    return;
-  }
-  damped_ = place->best.information;
-  damped_.diagonal() *= 1 + place->damping;
-  const Eigen::LLT<Eigen::Ref<MatrixXd>> factor(damped_);
-  step_vector_ = place->best.gradient;
-  factor.solveInPlace(step_vector_);
-  place->trial.start = place->best.start - step_vector_;
-}
+// ---- one window after the other ----
 
 const MatrixXd& StartFit::Fit(const double* parameters, const MatrixXd& windows) {
   const Index count = windows.cols();
   result_.resize(latent_size_, count);
-  Index next = 0, busy = 0;
+  Index next = 0;
+  size_t busy = 0;
   for (Place& place : places_) {
     place.window = kNone;
-    if (next == count) continue;
-    Begin(&place, next++, windows);
+    if (next >= count) continue;
+    BeginStretch(&place, next, windows);
+    next += kStretch;
     ++busy;
   }
   while (busy > 0) {
     Evaluate(parameters, windows);
-    for (Place& place : places_) {
+    for (size_t j = 0; j < places_.size(); ++j) {
+      Place& place = places_[j];
       if (place.window == kNone) continue;
-      if (!Judge(&place)) {
-        Propose(&place);
-        continue;
-      }
-      result_.col(place.window) = place.best.end;
+      Read(static_cast<Index>(j), &place.trial);
+      if (!Advance(&place, windows)) continue;
       if (next < count) {
-        Begin(&place, next++, windows);
+        BeginStretch(&place, next, windows);
+        next += kStretch;
       } else {
         place.window = kNone;
         --busy;
@@ -189,9 +104,158 @@ const MatrixXd& StartFit::Fit(const double* parameters, const MatrixXd& windows)
   return result_;
 }
 
-MatrixXd StartFit::Covariance(int32_t column) const {
-  const Point& p = places_[static_cast<size_t>(column)].best;
-  return p.sensitivity * p.information.llt().solve(p.sensitivity.transpose());
+void StartFit::BeginStretch(Place* place, Index first, const MatrixXd& windows) {
+  place->window = first;
+  place->stretch_end = std::min(first + kStretch, windows.cols());
+  BeginStart(place, Start::kGuess, windows);
+}
+
+void StartFit::BeginStart(Place* place, Start start, const MatrixXd& windows) {
+  place->start = start;
+  place->steps = 0;
+  place->damping = kFirstDamping;
+  VectorXd& at = place->trial.start;
+  switch (start) {
+    case Start::kContinued:
+      place->reference = place->fitted.cost;
+      at = place->fitted.second;
+      break;
+    case Start::kGuess:
+      at = guess_.col(windows.rows());
+      at.noalias() += guess_.leftCols(windows.rows()).lazyProduct(windows.col(place->window));
+      break;
+    case Start::kOrigin:
+      at.setZero();
+      break;
+  }
+}
+
+/// Decides, after a pass, where the next one is. Whether the stretch is done.
+bool StartFit::Advance(Place* place, const MatrixXd& windows) {
+  if (!Judge(place)) {
+    Propose(place);
+    return false;
+  }
+  const bool is_first = place->start == Start::kContinued || (place->start == Start::kGuess && place->window % kStretch == 0);
+  if (is_first || place->best.cost < place->fitted.cost) std::swap(place->best, place->fitted);
+  const bool as_before = place->start == Start::kContinued && place->fitted.cost <= place->reference + kSurprise;
+  if (!as_before && place->start != Start::kOrigin) {
+    BeginStart(place, place->start == Start::kContinued ? Start::kGuess : Start::kOrigin, windows);
+    return false;
+  }
+  result_.col(place->window) = place->fitted.end;
+  if (++place->window == place->stretch_end) return true;
+  BeginStart(place, Start::kContinued, windows);
+  return false;
+}
+
+// ---- steps from one start ----
+
+/// Keeps what is better, and eases or tightens the damping by how much of what was promised has come (H. B. Nielsen, Damping
+/// Parameter in Marquardt's Method, 1999). Whether the fit from this start has ended.
+bool StartFit::Judge(Place* place) const {
+  const bool is_start = place->steps++ == 0;
+  const double gained = place->best.cost - place->trial.cost;
+  const bool better = is_start || gained > 0;
+  if (better) std::swap(place->best, place->trial);
+  if (is_start) {
+    place->growth = 2;
+    return !std::isfinite(place->best.cost);
+  }
+  if (better) {
+    place->damping *= std::max(kEasing, 1 - std::pow(2 * gained / place->promised - 1, 3));
+    place->growth = 2;
+  } else {
+    place->damping *= place->growth;
+    place->growth *= 2;
+  }
+  return (better ? gained : place->promised) < kConverged || place->steps == kSteps;
+}
+
+void StartFit::Propose(Place* place) {
+  const Point& best = place->best;
+  damped_ = best.information;
+  damped_.diagonal() *= 1 + place->damping;
+  const Eigen::LLT<Eigen::Ref<MatrixXd>> factor(damped_);
+  step_vector_ = best.gradient;
+  factor.solveInPlace(step_vector_);
+  place->trial.start = best.start - step_vector_;
+  place->promised = step_vector_.dot(best.gradient) - 0.5 * step_vector_.dot(best.information.lazyProduct(step_vector_));
+}
+
+// ---- passes through the windows ----
+
+/// Runs every place's window from its trial's start.
+void StartFit::Evaluate(const double* parameters, const MatrixXd& windows) {
+  const Index rows = input_size_ + output_size_;
+  autodiff::Slots<double> slots;
+  slots.Input(kParameters, parameters)
+      .Input(kCarry, carry_.data())
+      .Input(kTangents, tangents_.data())
+      .Input(kInput, input_.data())
+      .Output(kNextOut, next_.data())
+      .Output(kOutputOut, output_.data())
+      .Output(kNextTangentsOut, next_tangents_.data())
+      .Output(kOutputTangentsOut, output_tangents_.data());
+  tangents_.setZero();
+  for (Index i = 0; i < latent_size_; ++i) tangents_.row(i).segment(i * width_, width_).setOnes();
+  for (Index j = 0; j < width_; ++j) carry_.col(j) = places_[static_cast<size_t>(j)].trial.start;
+  cost_.setZero();
+  gradient_.setZero();
+  information_.setZero();
+  for (Index k = 0; k + 1 < window_; ++k) {
+    for (Index j = 0; j < width_; ++j) {
+      const Index window = places_[static_cast<size_t>(j)].window;
+      if (window == kNone) continue;
+      input_.col(j) = windows.block((k + input_shift_) * rows, window, input_size_, 1);
+      measured_.col(j) = windows.block((k + 1) * rows + input_size_, window, output_size_, 1);
+    }
+    autodiff::Evaluate(*step_, slots, *arena_);
+    Accumulate();
+    carry_.swap(next_);
+    tangents_.swap(next_tangents_);
+    slots.Input(kCarry, carry_.data()).Input(kTangents, tangents_.data()).Output(kNextOut, next_.data()).Output(kNextTangentsOut, next_tangents_.data());
+    if (k == 0) second_ = carry_;
+  }
+}
+
+/// Adds what one sample says.
+void StartFit::Accumulate() {
+  for (Index c = 0; c < output_size_; ++c) {
+    residual_ = (output_.row(c) - measured_.row(c)).transpose();
+    cost_ += 0.5 * weights_[c] * residual_.square();
+    const auto by_component = [&](Index i) { return output_tangents_.row(c).segment(i * width_, width_).transpose().array(); };
+    Index pair = 0;
+    for (Index i = 0; i < latent_size_; ++i) {
+      weighted_ = weights_[c] * by_component(i);
+      gradient_.col(i) += weighted_ * residual_;
+      for (Index l = 0; l <= i; ++l) information_.col(pair++) += weighted_ * by_component(l);
+    }
+  }
+}
+
+/// What the last pass has found in one place.
+void StartFit::Read(Index column, Point* point) const {
+  const Index n = latent_size_;
+  point->second = second_.col(column);
+  point->end = carry_.col(column);
+  point->gradient.noalias() = start_precision_.lazyProduct(point->start);
+  point->cost = cost_(column, 0) + 0.5 * point->start.dot(point->gradient);
+  if (!std::isfinite(point->cost)) point->cost = std::numeric_limits<double>::infinity();
+  Index pair = 0;
+  for (Index i = 0; i < n; ++i) {
+    point->gradient[i] += gradient_(column, i);
+    point->sensitivity.col(i) = tangents_.col(i * width_ + column);
+    for (Index l = 0; l <= i; ++l) {
+      point->information(i, l) = start_precision_(i, l) + information_(column, pair++);
+      point->information(l, i) = point->information(i, l);
+    }
+  }
+}
+
+MatrixXd StartFit::Covariance() const {
+  const Point& fitted = places_[0].fitted;
+  return fitted.sensitivity * fitted.information.llt().solve(fitted.sensitivity.transpose());
 }
 
 }  // namespace metaekf::nssm
