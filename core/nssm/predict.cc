@@ -23,7 +23,6 @@ using Eigen::MatrixXd;
 enum Slot : int32_t { kParameters, kStart, kInputs, kNextInputs, kOutputsOut, kStatesOut, kCarryOut };
 
 constexpr Index kChunk = 4096;  // columns at a time: enough for wide products, little memory
-constexpr int32_t kFittedWindows = 32;  // side by side
 
 template <typename T>
 using MatrixT = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic>;
@@ -129,7 +128,7 @@ class Predictor {
 
   /// ψ of samples first … first + count − 1 where the model has no encoder.
   MatrixT<T> FitLatents(Index first, Index count) const {
-    StartFit fit(model_, *bundle_.prior, static_cast<int32_t>(std::min<Index>(kFittedWindows, count)));
+    StartFit fit(model_, *bundle_.prior, StartFit::WidthFor(count));
     Eigen::MatrixXd windows(model_.start_size(), count);
     for (Index j = 0; j < count; ++j) windows.col(j) = Stacked(first + j - warmup_ + 1);
     return fit.Fit(bundle_.parameters.data(), windows).template cast<T>();

@@ -21,6 +21,7 @@ namespace {
 enum Slot : int32_t { kParameters, kCarry, kTangents, kInput, kNextOut, kOutputOut, kNextTangentsOut, kOutputTangentsOut };
 
 constexpr Index kStretch = 32;       // windows that follow each other in one place
+constexpr Index kMostPlaces = 32;
 constexpr int kSteps = 60;           // from one start at most
 constexpr double kConverged = 0.1;   // decrease of ½ χ² that ends a fit: one-step errors are 0.7 % above those of the minimum
 constexpr double kSurprise = 10;     // of ½ χ² above the last window's, that asks for other starts
@@ -69,6 +70,10 @@ StartFit::StartFit(const Model& model, const GaussianPrior& prior, int32_t width
   information_.setZero(width, n * (n + 1) / 2);
   damped_.setZero(n, n);
   step_vector_.setZero(n);
+}
+
+int32_t StartFit::WidthFor(Index windows) {
+  return static_cast<int32_t>(std::clamp<Index>((windows + kStretch - 1) / kStretch, 1, kMostPlaces));
 }
 
 // ---- one window after the other ----
@@ -138,7 +143,8 @@ bool StartFit::Advance(Place* place, const MatrixXd& windows) {
   }
   const bool is_first = place->start == Start::kContinued || (place->start == Start::kGuess && place->window % kStretch == 0);
   if (is_first || place->best.cost < place->fitted.cost) std::swap(place->best, place->fitted);
-  const bool as_before = place->start == Start::kContinued && place->fitted.cost <= place->reference + kSurprise;
+  const bool as_before =
+      place->start == Start::kContinued && place->fitted.cost <= place->reference + kSurprise * UnitOf(place->reference);
   if (!as_before && place->start != Start::kOrigin) {
     BeginStart(place, place->start == Start::kContinued ? Start::kGuess : Start::kOrigin, windows);
     return false;
@@ -147,6 +153,12 @@ bool StartFit::Advance(Place* place, const MatrixXd& windows) {
   if (++place->window == place->stretch_end) return true;
   BeginStart(place, Start::kContinued, windows);
   return false;
+}
+
+/// What counts as one in ½ χ²: where a model explains a window worse than the noise can be, that misfit is its noise.
+double StartFit::UnitOf(double cost) const {
+  const double expected = 0.5 * static_cast<double>((window_ - 1) * output_size_);
+  return std::max(1.0, cost / expected);
 }
 
 // ---- steps from one start ----
@@ -169,7 +181,7 @@ bool StartFit::Judge(Place* place) const {
     place->damping *= place->growth;
     place->growth *= 2;
   }
-  return (better ? gained : place->promised) < kConverged || place->steps == kSteps;
+  return (better ? gained : place->promised) < kConverged * UnitOf(place->best.cost) || place->steps == kSteps;
 }
 
 void StartFit::Propose(Place* place) {

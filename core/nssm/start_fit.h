@@ -15,12 +15,15 @@ namespace metaekf::nssm {
 ///   ψ_s = argmin ½ Σ_{k=s+1…t} |y_k − ŷ_k(ψ_s)|²/σ² + ½ ψ_sᵀ Λ ψ_s,   s = t − H + 1
 ///
 /// by Levenberg–Marquardt with exact Jacobians, up to a tenth in ½ χ²: what is left to gain is a fraction of the standard
-/// deviation that the data leaves. A window begins where the trajectory through its predecessor goes on. Unless it is then
+/// deviation that the data leaves (of a model that explains the window worse than the noise, its misfit is the unit). A window begins where the trajectory through its predecessor goes on. Unless it is then
 /// explained about as well as that one was, it is fitted from the prior's guess and from 0 as well and the best is kept: the
 /// guess is of the fleet's models, and one that was fitted from scratch has other latents.
 /// In double, normalised units. One thread at a time.
 class StartFit {
  public:
+  /// How many windows side by side suit so many: those that follow each other are fitted one after the other.
+  static int32_t WidthFor(Eigen::Index windows);
+
   /// @param prior  its `start` is Λ, its `noise_variance` σ², its `start_guess` the guess. @param width  windows side by side.
   StartFit(const Model& model, const GaussianPrior& prior, int32_t width);
 
@@ -60,6 +63,7 @@ class StartFit {
   void Evaluate(const double* parameters, const Eigen::MatrixXd& windows);
   void Accumulate();
   void Read(Eigen::Index column, Point* point) const;
+  double UnitOf(double cost) const;
   bool Judge(Place* place) const;
   void Propose(Place* place);
 

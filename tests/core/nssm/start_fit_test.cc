@@ -2,6 +2,8 @@
 
 #include <gtest/gtest.h>
 
+#include <cmath>
+
 #include <Eigen/Cholesky>
 #include <Eigen/LU>
 
@@ -93,7 +95,7 @@ TEST(StartFitTest, ALinearModelsStartIsBayesianLinearRegressions) {
   const std::vector<double> parameters = RandomParameters(model, 6);
   GaussianPrior prior = Prior(model, 0.7 * kSure);
   prior.noise_variance /= kSure;
-  const Made made(model, parameters, 3, 0.5);
+  const Made made(model, parameters, 3, 0.5 / std::sqrt(kSure));
   // y_k = C ψ_k + d with ψ_k = A^k ψ_s + …: the regression by its definition.
   const Index n = spec.latent_size, n_y = spec.output_size, n_u = spec.input_size;
   MatrixXd information = prior.start, power = MatrixXd::Identity(n, n);
