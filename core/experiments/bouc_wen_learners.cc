@@ -63,7 +63,7 @@ constexpr Variant kVariants[] = {
     {"Xfer", kGradientBased, R"json({"algorithm": "SUPERVISED"})json"},
 };
 
-/// Some minutes for all learners together: a smaller network and fewer steps of everything, for the order of things.
+/// Some minutes for all learners together: fewer steps of everything, for the order of things.
 constexpr char kQuick[] = R"json({
   "iterations": 500, "warmup_iterations": 400,
   "gaussian_prior": {"restarts": 3, "first_steps": 40, "round_steps": 10, "rounds": 1}

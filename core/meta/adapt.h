@@ -16,8 +16,8 @@ namespace metaekf::meta {
 enum class AdaptationMethod {
   kGradientDescent,  ///< eq. maml_inner from the meta-learned parameters
   kAdam,             ///< the same loss and start, Adam steps
-  /// Without the meta-learned parameters: the baseline. A model whose start is fitted by Levenberg–Marquardt (FitFromScratch),
-  /// any other by Adam from a random initialisation.
+  /// Without the meta-learned parameters: the baseline. A model of GAUSSIAN_PRIOR by Levenberg–Marquardt from linear starts
+  /// (FitFromScratch), any other by Adam from a random initialisation.
   kFromScratch,
   /// The most probable parameters under the model's prior (FitSystem); of a model that IMPLICIT_MAML has trained with this
   /// optimiser the minimum that it was trained with (FitProximal).
@@ -32,7 +32,7 @@ struct AdaptationOptions {
 };
 
 /// What `adapt` does with a model unless told otherwise. Without a method: what its training specification says. The
-/// baseline from scratch is given all parameters and ten times the steps.
+/// baseline from scratch is given all parameters and, by Adam, ten times the steps.
 /// Errors: FailedPrecondition if the model file does not say how it was trained.
 absl::StatusOr<AdaptationOptions> DefaultAdaptation(const nssm::Bundle& bundle,
                                                     std::optional<AdaptationMethod> method = std::nullopt);
