@@ -243,8 +243,7 @@ absl::StatusOr<FitResult> FitAnyPrecision(const Bundle& bundle, const Problem& p
   if (options.method == AdaptationMethod::kLevenbergMarquardt && problem.trained_at_minimum) {
     return FitToMinimum(bundle, problem, normalised, options, on_step);
   }
-  const bool exactly_from_scratch = options.method == AdaptationMethod::kFromScratch && bundle.prior;
-  if (options.method == AdaptationMethod::kLevenbergMarquardt || exactly_from_scratch) {
+  if (options.method == AdaptationMethod::kLevenbergMarquardt || bundle.model.spec().fits_start()) {
     return FitByLevenbergMarquardt(bundle, problem, normalised, options, on_step);
   }
   return bundle.model.spec().precision == nssm::Precision::kFloat32
@@ -379,7 +378,7 @@ absl::StatusOr<AdaptationOptions> DefaultAdaptation(const Bundle& bundle, std::o
   const AdaptationMethod trained_for = MethodOf(options.inner_loop.optimiser);
   options.method = method.value_or(trained_for);
   if (options.method == AdaptationMethod::kFromScratch) {
-    if (!bundle.prior) options.inner_loop.steps *= kScratchSteps;
+    if (!bundle.model.spec().fits_start()) options.inner_loop.steps *= kScratchSteps;
     options.inner_loop.learning_rate = kScratchLearningRate;
     options.inner_loop.tensor_rates.clear();
     options.inner_loop.adapted_mask = "*";

@@ -16,8 +16,9 @@ namespace metaekf::meta {
 enum class AdaptationMethod {
   kGradientDescent,  ///< eq. maml_inner from the meta-learned parameters
   kAdam,             ///< the same loss and start, Adam steps
-  /// Without the meta-learned parameters: the baseline. A model of GAUSSIAN_PRIOR by Levenberg–Marquardt from linear starts
-  /// (FitFromScratch), any other by Adam from a random initialisation.
+  /// Without the meta-learned parameters: the baseline. A model whose start is fitted by Levenberg–Marquardt from linear starts
+  /// (FitFromScratch), any other by Adam from a random initialisation: exact fits of states measured for a few hundred samples
+  /// extrapolate worse.
   kFromScratch,
   /// The most probable parameters under the model's prior (FitSystem); of a model that IMPLICIT_MAML has trained with this
   /// optimiser the minimum that it was trained with (FitProximal).
