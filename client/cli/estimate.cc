@@ -157,7 +157,7 @@ absl::Status Estimate(const Flags& flags, Console& console) {
     file.open(flags.out, std::ios::binary);
   }
   std::ostream& out = flags.out == "-" ? console.out : file;
-  out << EstimateHeader(info.estimated, model.version.estimates_states) << std::flush;
+  out << EstimateHeader(info.estimated, model.version.estimates_states, info.constrained) << std::flush;
 
   History history;
   history.means.resize(info.estimate_size);

@@ -16,13 +16,14 @@ void AppendCell(double value, std::string& line) {
 
 }  // namespace
 
-std::string EstimateHeader(const std::vector<client::Channel>& estimated, bool states) {
+std::string EstimateHeader(const std::vector<client::Channel>& estimated, bool states,
+                           bool constrained) {
   std::string header = "t";
   for (const auto& channel : estimated) {
     absl::StrAppend(&header, ",", channel.name, states ? "" : "_hat");
   }
   for (const auto& channel : estimated) absl::StrAppend(&header, ",s", channel.name);
-  return header + ",nis,health,flags\n";
+  return absl::StrCat(header, ",nis,health,flags", constrained ? ",slack,projection" : "", "\n");
 }
 
 std::string EstimateRow(const client::EstimateBatch& batch, size_t i) {
@@ -32,8 +33,14 @@ std::string EstimateRow(const client::EstimateBatch& batch, size_t i) {
   for (size_t k = 0; k < n; ++k) AppendCell(batch.means[i * n + k], line);
   for (size_t k = 0; k < n; ++k) AppendCell(std::sqrt(batch.covariances[i * n + k]), line);
   AppendCell(batch.nis[i], line);
-  absl::StrAppend(&line, HealthWord(batch.health[i]), ",", FlagWords(batch.flags[i]), "\n");
-  return line;
+  absl::StrAppend(&line, HealthWord(batch.health[i]), ",", FlagWords(batch.flags[i]));
+  if (batch.slacks.size() == batch.samples) {
+    line += ',';
+    AppendCell(batch.slacks[i], line);
+    AppendCell(batch.projections[i], line);
+    line.pop_back();
+  }
+  return line + "\n";
 }
 
 const char* HealthWord(client::Health health) {

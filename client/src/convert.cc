@@ -190,7 +190,8 @@ SessionInfo FromProto(const v1::SessionOpened& message) {
                    .estimate_size = message.estimate_size(),
                    .estimated = ToChannels(message.estimated()),
                    .sample_period_s = message.sample_period_s(),
-                   .send_innovations = message.send_innovations()};
+                   .send_innovations = message.send_innovations(),
+                   .constrained = message.constrained()};
   if (message.covariance_format() == v1::OpenSession::DIAGONAL) {
     info.covariance = CovarianceFormat::kDiagonal;
   }
@@ -210,7 +211,9 @@ EstimateBatch FromProto(const v1::EstimateBatch& message) {
                       .innovations = ToVector(message.innovations()),
                       .innovation_covs = ToVector(message.innovation_covs()),
                       .nis = ToVector(message.nis()),
-                      .flags = ToVector(message.flags())};
+                      .flags = ToVector(message.flags()),
+                      .slacks = ToVector(message.slacks()),
+                      .projections = ToVector(message.projections())};
   for (const int health : message.health()) {
     // The numbers are the same on both sides.
     batch.health.push_back(health <= v1::EstimateBatch::DIVERGED ? static_cast<Health>(health)

@@ -254,6 +254,9 @@ class Compiler {
         i.activation = node.activation;
         i.order = node.order;
         break;
+      case Op::kSoftmax:
+        i.op = Opcode::kSoftmax;
+        break;
       case Op::kTile:
         i.op = Opcode::kCopy;
         i.a = Tiled(i.a, node);

@@ -32,6 +32,14 @@ std::vector<bool> AncestorsOf(const Graph& graph, const std::vector<Value>& outp
   return ancestor;
 }
 
+/// Of s = softmax(a), whose Jacobian is symmetric: (diag(s) − s sᵀ) v, column by column.
+Value SoftmaxDerivative(Graph* graph, Value s, Value v) {
+  const int32_t rows = graph->node(s).rows;
+  const Value product = graph->Mul(s, v);
+  const Value sums = graph->MatMul(graph->Constant(1, rows, rows), product);  // Σ s v in every row
+  return graph->Sub(product, graph->Mul(s, sums));
+}
+
 /// The derivative of a scan is a scan over an extended copy of its body, in which the primal carries are
 /// sequences: they are known by then. `active` says which body inputs have a derivative; carries are active if
 /// any active input reaches them through the recurrence.
@@ -176,6 +184,8 @@ class ForwardMode {
         const Value slope = graph_.Apply(node.activation, node.scalar, node.order + 1, node.inputs[0]);
         return graph_.Mul(Repeat(slope), t(0));
       }
+      case Op::kSoftmax:
+        return SoftmaxDerivative(&graph_, Repeat(v), t(0));
       case Op::kTile:
         return graph_.Tile(t(0), node.width, node.count);
       case Op::kSumTiles:
@@ -340,6 +350,9 @@ class ReverseMode {
         Accumulate(in(0), graph_.Mul(slope, g));
         return;
       }
+      case Op::kSoftmax:
+        Accumulate(in(0), SoftmaxDerivative(&graph_, graph_.Softmax(in(0)), g));
+        return;
       case Op::kTile:
         Accumulate(in(0), graph_.SumTiles(g, node.width, node.count));
         return;

@@ -1,6 +1,7 @@
 #include "core/autodiff/evaluate.h"
 
 #include <algorithm>
+#include <cmath>
 #include <cstring>
 #include <new>
 
@@ -117,6 +118,8 @@ class Machine {
       case Opcode::kActivation:
         return ApplyActivation(i.activation, i.order, T(i.scalar), At(i.a, t), At(i.out, t),
                                static_cast<size_t>(int64_t{i.rows} * i.cols));
+      case Opcode::kSoftmax:
+        return Softmax(i, t);
       case Opcode::kSumTiles:
         return SumTiles(i, t);
       case Opcode::kCopyRows: {
@@ -159,6 +162,18 @@ class Machine {
       sum += static_cast<double>(partial);
     }
     *At(i.out, t) = static_cast<T>(sum);
+  }
+
+  /// Less the largest of a column, so that nothing overflows.
+  void Softmax(const Instruction& i, int64_t t) const {
+    for (int32_t col = 0; col < i.cols; ++col) {
+      const T* a = At(i.a, t) + int64_t{col} * i.a.ld;
+      T* out = At(i.out, t) + int64_t{col} * i.out.ld;
+      const T largest = *std::max_element(a, a + i.rows);
+      T sum = 0;
+      for (int32_t k = 0; k < i.rows; ++k) sum += out[k] = std::exp(a[k] - largest);
+      for (int32_t k = 0; k < i.rows; ++k) out[k] /= sum;
+    }
   }
 
   void SumTiles(const Instruction& i, int64_t t) const {

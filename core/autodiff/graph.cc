@@ -126,6 +126,12 @@ Value Graph::Apply(Activation activation, double parameter, int order, Value a) 
                  .scalar = parameter});
 }
 
+Value Graph::Softmax(Value a) {
+  const int32_t rows = node(a).rows, cols = node(a).cols;
+  if (rows == 1) return Constant(1, 1, cols);
+  return Append({.op = Op::kSoftmax, .rows = rows, .cols = cols, .inputs = {a}});
+}
+
 Value Graph::Tile(Value a, int32_t width, int32_t count) {
   const Node& operand = node(a);
   assert(operand.cols % width == 0);

@@ -24,6 +24,7 @@ enum class Op : uint8_t {
   kScaleBy,     // a · B, a being 1 × 1
   kDot,         // Σ A ⊙ B, 1 × 1
   kActivation,  // σ^(order)(A)
+  kSoftmax,     // e^a / Σ e^a, column by column
   kTile,        // each block of `width` columns, `count` times in a row
   kSumTiles,    // the transpose of kTile: sums runs of `count` blocks
   kConcatRows,  // [A; B; …]
@@ -90,6 +91,7 @@ class Graph {
   Value ScaleBy(Value scalar, Value a);
   Value Dot(Value a, Value b);
   Value Apply(Activation activation, double parameter, int order, Value a);
+  Value Softmax(Value a);
   /// Repeats each block of `width` columns `count` times: [a₁ a₂] → [a₁ … a₁ a₂ … a₂].
   Value Tile(Value a, int32_t width, int32_t count);
   Value SumTiles(Value a, int32_t width, int32_t count);

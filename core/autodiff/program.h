@@ -32,6 +32,7 @@ enum class Opcode : uint8_t {
   kScaleBy,
   kDot,
   kActivation,
+  kSoftmax,
   kSumTiles,
   kCopyRows,   // out's rows first … = a
   kSliceRows,  // out = a's rows first …

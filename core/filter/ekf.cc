@@ -5,7 +5,9 @@
 
 #include "core/base/numbers.h"
 #include "core/base/status.h"
+#include "core/filter/constrain.h"
 #include "core/filter/square_root.h"
+#include "core/physics/projection.h"
 
 namespace metaekf::filter {
 namespace {
@@ -63,6 +65,11 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
   ekf.state_size_ = ekf.model_->state_size();
   ekf.window_size_ = ekf.case_one_ ? static_cast<size_t>(bundle.model.start_size()) : 0;
   ekf.normaliser_ = bundle.normaliser;
+  const physics::Polyhedron* const set = ekf.case_one_ ? bundle.model.output_set() : bundle.model.state_set();
+  if (set != nullptr) ekf.set_ = *set;
+  if (set != nullptr && !ekf.case_one_) {
+    ekf.normalised_set_ = InUnits(*set, bundle.normaliser.states.mean, bundle.normaliser.states.scale);
+  }
   const Index n = ekf.state_size_, n_y = ekf.output_size_;
   const VectorXd state_scale = ekf.case_one_ ? VectorXd::Ones(n) : bundle.normaliser.states.scale;
 
@@ -148,6 +155,11 @@ absl::Status Ekf::Step(const Ref<const VectorXd>& input, const Ref<const VectorX
   ++state_.samples;
   state_.last_input = u_;
   MeasurementUpdate(scratch, estimate);
+  if (normalised_set_ && state_.mean.allFinite() && state_.factor.allFinite()) {
+    const ConstraintEffect effect = Constrain(*normalised_set_, &state_.mean, &state_.factor);
+    estimate->slack = effect.slack;
+    estimate->projection = effect.projection;
+  }
   WriteEstimate(scratch, estimate);
   JudgeHealth(estimate);
   return absl::OkStatus();
@@ -246,6 +258,9 @@ void Ekf::WriteEstimate(FilterModel::Scratch* scratch, Estimate* estimate) {
   } else {
     estimate->mean = state_.mean.cwiseProduct(scaling.scale) + scaling.mean;
     root = state_.factor;
+  }
+  if (set_ && estimate->mean.allFinite() && !physics::Contains(*set_, estimate->mean)) {
+    estimate->mean = physics::Inside(*set_, estimate->mean);  // rounding has put it outside
   }
   for (Index i = 0; i < root.rows(); ++i) root.row(i) *= scaling.scale[i];
   estimate->cov.noalias() = root.lazyProduct(root.transpose());

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <limits>
 #include <memory>
 #include <optional>
 #include <vector>
@@ -24,6 +25,8 @@ struct Estimate {
   Eigen::MatrixXd innovation_cov;  ///< S = H P⁻ Hᵀ + R; NaN where not measured
   double nis = 0;                  ///< ỹᵀ S⁻¹ ỹ over what was measured; NaN where nothing was
   int measured = 0;                ///< components of y that were
+  /// Of a model whose states lie in a set: what Constrain has found and done, in units of the states' scales; else NaN.
+  double slack = std::numeric_limits<double>::quiet_NaN(), projection = std::numeric_limits<double>::quiet_NaN();
   Health health = Health::kWarmingUp;
 };
 
@@ -52,10 +55,11 @@ struct FilterState {
 ///   ỹ = y − h(x⁻, u_t)       S = H P⁻ Hᵀ + R
 ///   x⁺ = x⁻ + K ỹ            P⁺ = (I − K H) P⁻           K = P⁻ Hᵀ S⁻¹
 ///
-/// in square-root form. Components of y that are NaN are not measured; if all are, only time passes. In Case I the state
+/// in square-root form. Where the model's states lie in a set, the estimate is put inside (Constrain), and the mean that is
+/// given out is inside to rounding in physical units. Components of y that are NaN are not measured; if all are, only time passes. In Case I the state
 /// is the latent ψ; the first H fully measured samples in a row fill the encoder's window, the last of them gives the
 /// first estimate.
-/// A filter is used by one thread at a time; Step does not allocate.
+/// A filter is used by one thread at a time; Step does not allocate, unless a constraint moves the estimate.
 /// Source: paper.tex eqs. deep_cekf_all, jac_defs; the square-root form is ours.
 class Ekf {
  public:
@@ -84,6 +88,8 @@ class Ekf {
   int32_t estimate_size() const { return case_one_ ? output_size_ : state_size_; }
   int32_t input_size() const { return input_size_; }
   int32_t output_size() const { return output_size_; }
+  /// Whether estimates come with slack and projection.
+  bool constrained() const { return normalised_set_.has_value(); }
 
  private:
   Ekf() = default;
@@ -101,6 +107,8 @@ class Ekf {
   int32_t input_size_ = 0, output_size_ = 0, state_size_ = 0;
   size_t window_size_ = 0;  // Case I: values in a full window
   data::Normaliser normaliser_;
+  std::optional<physics::Polyhedron> set_;             // of what is estimated, in physical units
+  std::optional<physics::Polyhedron> normalised_set_;  // of the state
   Eigen::MatrixXd process_factor_;    // Q^½, normalised
   Eigen::MatrixXd measurement_cov_;   // R, normalised
   Eigen::MatrixXd initial_factor_;

@@ -121,11 +121,6 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
       base::Annotate(nssm::ShapeOfLoss(spec.model, spec.loss, spec.context_samples).status(), "context_samples"));
   METAEKF_RETURN_IF_ERROR(
       base::Annotate(nssm::ShapeOfLoss(spec.model, spec.loss, spec.target_samples).status(), "target_samples"));
-  METAEKF_ASSIGN_OR_RETURN(const nssm::Model model, nssm::Model::Create(spec.model));
-  METAEKF_ASSIGN_OR_RETURN(const nn::Mask mask, nn::ParseMask(spec.inner_loop.adapted_mask, model.layout()));
-  METAEKF_RETURN_IF_ERROR(nn::ParseMask(spec.adaptation.adapted_mask, model.layout()).status());
-  METAEKF_RETURN_IF_ERROR(CheckTensorRates(spec.inner_loop, model.layout()));
-  METAEKF_RETURN_IF_ERROR(CheckTensorRates(spec.adaptation, model.layout()));
   METAEKF_ASSIGN_OR_RETURN(const data::Split split,
                            data::SplitSystems(fleet.trajectories.size(), spec.validation_share, spec.seed));
 
@@ -136,6 +131,12 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
   }
   METAEKF_ASSIGN_OR_RETURN(const Dataset training_set, data::Subset(used, split.training));
   METAEKF_ASSIGN_OR_RETURN(const data::Normaliser normaliser, data::FitNormaliser(training_set, ScaleGroups(spec.model)));
+  nssm::TakeUnits(normaliser, &spec.model);
+  METAEKF_ASSIGN_OR_RETURN(const nssm::Model model, nssm::Model::Create(spec.model));
+  METAEKF_ASSIGN_OR_RETURN(const nn::Mask mask, nn::ParseMask(spec.inner_loop.adapted_mask, model.layout()));
+  METAEKF_RETURN_IF_ERROR(nn::ParseMask(spec.adaptation.adapted_mask, model.layout()).status());
+  METAEKF_RETURN_IF_ERROR(CheckTensorRates(spec.inner_loop, model.layout()));
+  METAEKF_RETURN_IF_ERROR(CheckTensorRates(spec.adaptation, model.layout()));
   std::vector<Trajectory> normalised;
   for (const Trajectory& trajectory : used.trajectories) {
     METAEKF_ASSIGN_OR_RETURN(Trajectory n, data::Normalised(normaliser, trajectory));

@@ -19,10 +19,18 @@ absl::StatusOr<Model> Model::Create(const ModelSpec& spec) {
   if (spec.input_size < 0 || spec.output_size < 0 || spec.state_size < 0) {
     return absl::InvalidArgumentError("the model's input, output and state sizes are not known yet");
   }
-  return Model(spec);
+  std::optional<physics::Polyhedron> state_set, output_set;
+  if (!spec.state_set.empty()) {
+    METAEKF_ASSIGN_OR_RETURN(state_set, PolyhedronOf(spec.state_set, spec.state_size));
+  }
+  if (!spec.output_set.empty()) {
+    METAEKF_ASSIGN_OR_RETURN(output_set, PolyhedronOf(spec.output_set, spec.output_size));
+  }
+  return Model(spec, std::move(state_set), std::move(output_set));
 }
 
-Model::Model(const ModelSpec& spec) : spec_(spec) {
+Model::Model(const ModelSpec& spec, std::optional<physics::Polyhedron> state_set, std::optional<physics::Polyhedron> output_set)
+    : spec_(spec), state_set_(std::move(state_set)), output_set_(std::move(output_set)) {
   const int32_t latent = spec.latent_size, inputs = spec.input_size;
   const TransitionSpec& transition = spec.transition;
   const bool joint = transition.form == TransitionForm::kJoint && inputs > 0;
@@ -44,6 +52,14 @@ Model::Model(const ModelSpec& spec) : spec_(spec) {
   }
   const int32_t decoded = spec.is_curl_free() ? 1 : spec.output_size;
   output_decoder_ = nn::Block("output_decoder", spec.output_decoder, latent, decoded, &layout_);
+  const auto constrain = [this](const std::string& name, const physics::Polyhedron& set, const PolyhedronSpec& in) {
+    const bool has_units = in.mean.size() > 0;
+    const Eigen::Index n = set.dimension();
+    return physics::PolyhedralLayer(name, set, has_units ? in.mean : Eigen::VectorXd(Eigen::VectorXd::Zero(n)),
+                                    has_units ? in.scale : Eigen::VectorXd(Eigen::VectorXd::Ones(n)), &layout_);
+  };
+  if (state_set_) state_constraint_ = constrain("state_constraint", *state_set_, spec.state_set);
+  if (output_set_) output_constraint_ = constrain("output_constraint", *output_set_, spec.output_set);
 }
 
 int32_t Model::start_size() const {
@@ -68,6 +84,8 @@ std::vector<double> Model::InitialParameters(uint64_t seed) const {
   for (const nn::Block* block : {&encoder_, &transition_, &transition_input_, &state_decoder_, &output_decoder_}) {
     block->Initialise(layout_, &rng, parameters);
   }
+  if (state_set_) state_constraint_.Initialise(layout_, parameters);
+  if (output_set_) output_constraint_.Initialise(layout_, parameters);
   if (!spec_.is_case_one() && spec_.encoder.hidden_widths.empty() && spec_.state_decoder.hidden_widths.empty()) {
     StartWithExactReconstruction(parameters);
   }
@@ -111,10 +129,14 @@ Value ModelGraph::Advance(Value latent, Value input) const {
   return next;
 }
 
-Value ModelGraph::State(Value latent) const { return model_.state_decoder_.Apply(graph_, parameters_, latent); }
+Value ModelGraph::State(Value latent) const {
+  const Value decoded = model_.state_decoder_.Apply(graph_, parameters_, latent);
+  return model_.state_set_ ? model_.state_constraint_.Apply(graph_, parameters_, decoded) : decoded;
+}
 
 Value ModelGraph::Output(Value latent, Value state) const {
   const Value decoded = model_.output_decoder_.Apply(graph_, parameters_, latent);
+  if (model_.output_set_) return model_.output_constraint_.Apply(graph_, parameters_, decoded);
   if (!model_.spec_.is_curl_free()) return decoded;
   return physics::CurlFree(graph_, decoded, state, model_.spec_.curl_free_positions);
 }

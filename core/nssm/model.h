@@ -1,5 +1,6 @@
 #pragma once
 
+#include <optional>
 #include <span>
 #include <vector>
 
@@ -7,6 +8,7 @@
 #include "core/nn/block.h"
 #include "core/nn/parameters.h"
 #include "core/nssm/spec.h"
+#include "core/physics/polyhedral_layer.h"
 
 namespace metaekf::nssm {
 
@@ -20,27 +22,32 @@ namespace metaekf::nssm {
 /// Source: paper.tex eqs. nssm_case1, nssm_case2, vcc_model_for_ekf.
 class Model {
  public:
-  /// Errors: InvalidArgument if a size of the spec is still to be taken from data.
+  /// Errors: InvalidArgument if a size of the spec is still to be taken from data, or for a constraint (PolyhedronOf).
   static absl::StatusOr<Model> Create(const ModelSpec& spec);
 
   const ModelSpec& spec() const { return spec_; }
   const nn::ParameterLayout& layout() const { return layout_; }
   /// Rows of the encoder's first argument: H (n_u + n_y) in Case I, n_x in Case II.
   int32_t start_size() const;
+  /// The sets that states and outputs lie in, in physical units; nullptr where they are free.
+  const physics::Polyhedron* state_set() const { return state_set_ ? &*state_set_ : nullptr; }
+  const physics::Polyhedron* output_set() const { return output_set_ ? &*output_set_ : nullptr; }
   /// ω₀ drawn from the seed.
   std::vector<double> InitialParameters(uint64_t seed) const;
 
  private:
   friend class ModelGraph;
-  explicit Model(const ModelSpec& spec);
+  Model(const ModelSpec& spec, std::optional<physics::Polyhedron> state_set, std::optional<physics::Polyhedron> output_set);
   /// Linear 𝓔 and 𝓓x: 𝓓x starts as the pseudo-inverse of 𝓔 on x, so that a rollout through the state neither dies
   /// out nor explodes before anything is learned.
   void StartWithExactReconstruction(std::span<double> parameters) const;
 
   ModelSpec spec_;
+  std::optional<physics::Polyhedron> state_set_, output_set_;
   nn::ParameterLayout layout_;
   nn::Block encoder_, transition_, transition_input_, state_decoder_, output_decoder_;
   size_t state_bypass_ = 0, input_bypass_ = 0;  // tensors L and B of the linear bypass
+  physics::PolyhedralLayer state_constraint_, output_constraint_;
 };
 
 /// A model's parts as operations of a graph: the one definition that every derivative comes from.

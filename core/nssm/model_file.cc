@@ -215,18 +215,20 @@ absl::StatusOr<Bundle> ReadModelFile(const std::string& bytes) {
     return absl::InvalidArgumentError(absl::StrCat("the file has format version ", version, ", this program reads version ",
                                                    kModelFormatVersion));
   }
-  METAEKF_ASSIGN_OR_RETURN(const ModelSpec spec, ReadModelSpec(fields.Object("model")));
+  METAEKF_ASSIGN_OR_RETURN(ModelSpec spec, ReadModelSpec(fields.Object("model")));
+  data::Normaliser normaliser;
+  JsonFields normalisation = fields.Object("normalisation");
+  normaliser.inputs = ReadScaling(&normalisation, "inputs", spec.input_size);
+  normaliser.outputs = ReadScaling(&normalisation, "outputs", spec.output_size);
+  normaliser.states = ReadScaling(&normalisation, "states", spec.state_size);
+  METAEKF_RETURN_IF_ERROR(normalisation.Finish());
+  TakeUnits(normaliser, &spec);
   METAEKF_ASSIGN_OR_RETURN(Model model, Model::Create(spec));
-  Bundle bundle{.model = std::move(model)};
+  Bundle bundle{.model = std::move(model), .normaliser = std::move(normaliser)};
   bundle.sample_period_s = fields.Number("sample_period_s", 0, 1e-12, 1e12);
   bundle.names.inputs = ReadNames(&fields, object, "input_names", spec.input_size);
   bundle.names.outputs = ReadNames(&fields, object, "output_names", spec.output_size);
   bundle.names.states = ReadNames(&fields, object, "state_names", spec.state_size);
-  JsonFields normalisation = fields.Object("normalisation");
-  bundle.normaliser.inputs = ReadScaling(&normalisation, "inputs", spec.input_size);
-  bundle.normaliser.outputs = ReadScaling(&normalisation, "outputs", spec.output_size);
-  bundle.normaliser.states = ReadScaling(&normalisation, "states", spec.state_size);
-  METAEKF_RETURN_IF_ERROR(normalisation.Finish());
   if (!object.contains("noise") || !object["noise"].is_object()) {
     return absl::InvalidArgumentError("metadata.noise is missing");
   }

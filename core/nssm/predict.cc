@@ -7,6 +7,7 @@
 #include "core/autodiff/evaluate.h"
 #include "core/base/status.h"
 #include "core/nssm/start_fit.h"
+#include "core/physics/projection.h"
 
 namespace metaekf::nssm {
 namespace {
@@ -204,6 +205,14 @@ class Predictor {
   std::map<int32_t, Compiled> programs_;  // by columns or steps; a Predictor runs in one mode only
 };
 
+/// The layer of a constraint is exact but for rounding, in the model's precision; what is predicted is inside in double.
+void PutInside(const physics::Polyhedron* set, MatrixXd* values) {
+  if (set == nullptr) return;
+  for (Index t = 0; t < values->cols(); ++t) {
+    if (values->col(t).allFinite()) values->col(t) = physics::Inside(*set, values->col(t));
+  }
+}
+
 template <typename T>
 Prediction Run(const Bundle& bundle, const data::Trajectory& normalised, PredictionMode mode) {
   Predictor<T> predictor(bundle, normalised);
@@ -229,6 +238,8 @@ absl::StatusOr<Prediction> Predict(const Bundle& bundle, const data::Trajectory&
                                                                 : Run<double>(bundle, normalised, mode);
   prediction.outputs = bundle.normaliser.outputs.Denormalise(prediction.outputs);
   if (!spec.is_case_one()) prediction.states = bundle.normaliser.states.Denormalise(prediction.states);
+  PutInside(bundle.model.output_set(), &prediction.outputs);
+  PutInside(bundle.model.state_set(), &prediction.states);
   return prediction;
 }
 

@@ -76,8 +76,39 @@ TransitionSpec ReadTransition(JsonFields* parent) {
   return spec;
 }
 
+PolyhedronSpec ReadPolyhedron(JsonFields* parent, int32_t size) {
+  PolyhedronSpec spec;
+  if (!parent->Has("polyhedron")) return spec;
+  JsonFields fields = parent->Object("polyhedron");
+  spec.matrix = fields.Numbers("matrix");
+  spec.bounds = fields.Numbers("bounds");
+  spec.rays = fields.Numbers("rays");
+  if (spec.empty()) fields.Fail("matrix", "give the rows of G, or rays");
+  if (!spec.rays.empty() && spec.matrix.size() + spec.bounds.size() > 0) fields.Fail("rays", "stand instead of matrix and bounds");
+  parent->Include(fields.Finish());
+  if (!spec.empty() && size != ModelSpec::kFromData) {
+    const absl::Status status = PolyhedronOf(spec, size).status();
+    if (!status.ok()) parent->Fail("polyhedron", std::string(status.message()));
+  }
+  return spec;
+}
+
+json PolyhedronJson(const PolyhedronSpec& spec) {
+  if (!spec.rays.empty()) return {{"polyhedron", {{"rays", spec.rays}}}};
+  return {{"polyhedron", {{"matrix", spec.matrix}, {"bounds", spec.bounds}}}};
+}
+
+void ReadStateConstraint(JsonFields* parent, ModelSpec* spec) {
+  if (!parent->Has("state_constraint")) return;
+  if (spec->is_case_one()) return parent->Fail("state_constraint", "Case I (INPUT_OUTPUT) has no states");
+  JsonFields fields = parent->Object("state_constraint");
+  spec->state_set = ReadPolyhedron(&fields, spec->state_size);
+  parent->Include(fields.Finish());
+}
+
 void ReadConstraint(JsonFields* parent, ModelSpec* spec) {
   JsonFields fields = parent->Object("output_constraint");
+  spec->output_set = ReadPolyhedron(&fields, spec->output_size);
   if (fields.Has("curl_free")) {
     JsonFields curl_free = fields.Object("curl_free");
     spec->curl_free_positions = curl_free.Integers("position_states", 0, kLargestWidth);
@@ -115,6 +146,32 @@ void CheckCurlFree(JsonFields* fields, const ModelSpec& spec) {
 
 }  // namespace
 
+absl::StatusOr<physics::Polyhedron> PolyhedronOf(const PolyhedronSpec& spec, int32_t size) {
+  using Eigen::Index;
+  using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+  const std::vector<double>& numbers = spec.rays.empty() ? spec.matrix : spec.rays;
+  const Index rows = static_cast<Index>(numbers.size()) / size;
+  if (rows * size != static_cast<Index>(numbers.size())) {
+    return absl::InvalidArgumentError(absl::StrCat(spec.rays.empty() ? "matrix: " : "rays: ", numbers.size(), " numbers are no whole rows of ",
+                                                   size, ", one for each channel"));
+  }
+  const Eigen::Map<const RowMajor> matrix(numbers.data(), rows, size);
+  if (!spec.rays.empty()) return physics::ConeOfRays(matrix.transpose());
+  if (!spec.bounds.empty() && static_cast<Index>(spec.bounds.size()) != rows) {
+    return absl::InvalidArgumentError(absl::StrCat("bounds: ", spec.bounds.size(), " for ", rows, " rows"));
+  }
+  Eigen::VectorXd bounds = Eigen::VectorXd::Zero(rows);
+  if (!spec.bounds.empty()) bounds = Eigen::Map<const Eigen::VectorXd>(spec.bounds.data(), rows);
+  return physics::MakePolyhedron(matrix, bounds);
+}
+
+void TakeUnits(const data::Normaliser& normaliser, ModelSpec* spec) {
+  spec->state_set.mean = normaliser.states.mean;
+  spec->state_set.scale = normaliser.states.scale;
+  spec->output_set.mean = normaliser.outputs.mean;
+  spec->output_set.scale = normaliser.outputs.scale;
+}
+
 absl::StatusOr<ModelSpec> ReadModelSpec(JsonFields fields) {
   ModelSpec spec;
   if (!fields.Has("case")) fields.Fail("case", "say INPUT_OUTPUT (Case I) or STATE_INPUT_OUTPUT (Case II)");
@@ -139,6 +196,7 @@ absl::StatusOr<ModelSpec> ReadModelSpec(JsonFields fields) {
   spec.state_decoder = ReadBlock(&fields, "state_decoder");
   spec.output_decoder = ReadBlock(&fields, "output_decoder");
   ReadConstraint(&fields, &spec);
+  ReadStateConstraint(&fields, &spec);
   spec.precision = fields.Choice("precision", Precision::kFloat32, kPrecisions);
   if (!spec.is_case_one() && spec.transition.input_time == InputTime::kNext) {
     fields.Fail("transition.input_time", "NEXT is for Case I; in Case II the transition takes u_t, as the encoder does");
@@ -198,6 +256,8 @@ json ToJson(const ModelSpec& spec) {
   if (spec.is_curl_free()) {
     result["output_constraint"] = {{"curl_free", {{"position_states", spec.curl_free_positions}}}};
   }
+  if (!spec.output_set.empty()) result["output_constraint"] = PolyhedronJson(spec.output_set);
+  if (!spec.state_set.empty()) result["state_constraint"] = PolyhedronJson(spec.state_set);
   return result;
 }
 

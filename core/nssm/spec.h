@@ -1,12 +1,15 @@
 #pragma once
 
+#include <Eigen/Core>
 #include <cstdint>
 #include <nlohmann/json.hpp>
 #include <vector>
 
 #include "absl/status/statusor.h"
 #include "core/base/json_fields.h"
+#include "core/data/normaliser.h"
 #include "core/nn/block.h"
+#include "core/physics/polyhedron.h"
 
 namespace metaekf::nssm {
 
@@ -29,6 +32,19 @@ struct TransitionSpec {
   double increment_scale = 1;  // γ
 };
 
+/// {x : G x ≤ g} or the cone of some rays, in physical units: the message ConstraintSpec.Polyhedron.
+struct PolyhedronSpec {
+  std::vector<double> matrix, bounds, rays;
+  /// What stands between those units and the model's, of a model that has a normaliser; not part of the message.
+  Eigen::VectorXd mean, scale;
+
+  bool empty() const { return matrix.empty() && rays.empty(); }
+};
+
+/// The set that a specification means. @param size  n.
+/// Errors: InvalidArgument if the numbers are no whole rows of n, or those of physics::MakePolyhedron.
+absl::StatusOr<physics::Polyhedron> PolyhedronOf(const PolyhedronSpec& spec, int32_t size);
+
 /// What a model is: the message ModelSpec of spec.proto, where each field is described.
 struct ModelSpec {
   static constexpr int32_t kFromData = -1;
@@ -44,6 +60,7 @@ struct ModelSpec {
   nn::BlockSpec state_decoder;
   nn::BlockSpec output_decoder;
   std::vector<int32_t> curl_free_positions;  ///< not empty: 𝓟y is the gradient with respect to these states
+  PolyhedronSpec state_set, output_set;  ///< 𝓟x of Case II, 𝓟y; empty: none
   Precision precision = Precision::kFloat32;
   StartMode start = StartMode::kEncoded;
 
@@ -66,6 +83,9 @@ struct LossSpec {
   double state_weight = 1;
   double reconstruction_weight = 1;
 };
+
+/// Tells the constraints of a model what its normaliser is.
+void TakeUnits(const data::Normaliser& normaliser, ModelSpec* spec);
 
 /// Read the JSON forms of the messages. Errors: InvalidArgument naming the field and what is wrong with it.
 absl::StatusOr<ModelSpec> ReadModelSpec(base::JsonFields fields);

@@ -161,6 +161,7 @@ void Session::Describe(v1::SessionOpened* opened) const {
   opened->set_sample_period_s(period_s_);
   opened->set_covariance_format(covariance_format_);
   opened->set_send_innovations(send_innovations_);
+  opened->set_constrained(ekf_.constrained());
 }
 
 absl::Status Session::Check(const v1::SampleBatch& batch, int64_t rows) const {
@@ -270,7 +271,13 @@ void Session::Append(const double* output, EstimateBatch* estimates) const {
   estimates->add_health(ToMessage(estimate_.health));
   bool missing = false;
   for (int32_t i = 0; i < ekf_.output_size(); ++i) missing = missing || std::isnan(output[i]);
-  estimates->add_flags(missing ? EstimateBatch::MISSING : EstimateBatch::NO_FLAG);
+  uint32_t flags = missing ? EstimateBatch::MISSING : EstimateBatch::NO_FLAG;
+  if (ekf_.constrained()) {
+    if (estimate_.projection > 0) flags |= EstimateBatch::PROJECTED;
+    estimates->add_slacks(estimate_.slack);
+    estimates->add_projections(estimate_.projection);
+  }
+  estimates->add_flags(flags);
 }
 
 std::string Session::Checkpoint() const {

@@ -273,6 +273,7 @@ struct SessionInfo {
   double sample_period_s = 0;
   CovarianceFormat covariance = CovarianceFormat::kNone;
   bool send_innovations = false;
+  bool constrained = false;  ///< estimates come with slacks and projections
 };
 
 /// Consecutive samples, flattened row by row. NaN in outputs: not measured.
@@ -306,6 +307,9 @@ struct EstimateBatch {
   std::vector<double> nis;  ///< normalised innovation squared, NaN where nothing was measured
   std::vector<Health> health;
   std::vector<uint32_t> flags;
+  /// Of sessions that are constrained, in units of the states' scales: the distance to the nearest
+  /// constraint before the estimate was put inside, negative outside, and how far it was moved.
+  std::vector<double> slacks, projections;
 };
 
 struct Options {

@@ -11,8 +11,9 @@ const double kNaN = std::nan("");
 
 TEST(EstimateRowsTest, TheHeaderNamesStatesOrOutputs) {
   // The contract's columns.
-  EXPECT_EQ(EstimateHeader({{"x1", ""}, {"x2", ""}}, true), "t,x1,x2,sx1,sx2,nis,health,flags\n");
-  EXPECT_EQ(EstimateHeader({{"y1", "m"}}, false), "t,y1_hat,sy1,nis,health,flags\n");
+  EXPECT_EQ(EstimateHeader({{"x1", ""}, {"x2", ""}}, true, false), "t,x1,x2,sx1,sx2,nis,health,flags\n");
+  EXPECT_EQ(EstimateHeader({{"y1", "m"}}, false, false), "t,y1_hat,sy1,nis,health,flags\n");
+  EXPECT_EQ(EstimateHeader({{"x1", ""}}, true, true), "t,x1,sx1,nis,health,flags,slack,projection\n");
 }
 
 TEST(EstimateRowsTest, RowsReadBackExactlyAndLeaveOutWhatIsNotThere) {
@@ -26,6 +27,19 @@ TEST(EstimateRowsTest, RowsReadBackExactlyAndLeaveOutWhatIsNotThere) {
   // Deviations are roots of the variances.
   EXPECT_EQ(EstimateRow(batch, 0), "0.1,0.3333333333333333,-2,2,0.5,1e-300,consistent,\n");
   EXPECT_EQ(EstimateRow(batch, 1), "0.2,,,,,,warming_up,missing|reset\n");
+}
+
+TEST(EstimateRowsTest, ConstrainedRowsEndWithSlackAndProjection) {
+  const client::EstimateBatch batch{.samples = 1,
+                                    .times_s = {0},
+                                    .means = {1},
+                                    .covariances = {4},
+                                    .nis = {2},
+                                    .health = {client::Health::kConsistent},
+                                    .flags = {client::kProjected},
+                                    .slacks = {-0.25},
+                                    .projections = {0.25}};
+  EXPECT_EQ(EstimateRow(batch, 0), "0,1,2,2,consistent,projected,-0.25,0.25\n");
 }
 
 TEST(EstimateRowsTest, WordsAreThoseOfTheContract) {

@@ -25,6 +25,11 @@ std::vector<DifferentiableCase> OperationCases() {
   cases.push_back({"ScaleBy and Dot",
                    {{3, 2}, {3, 2}},
                    [](Graph* g, const std::vector<Value>& x) { return g->ScaleBy(g->Dot(x[0], x[1]), Tanh(g, x[0])); }});
+  cases.push_back({"Softmax",
+                   {{4, 3}, {4, 3}},
+                   [](Graph* g, const std::vector<Value>& x) {
+                     return g->Mul(g->Softmax(g->Scale(Tanh(g, x[0]), 3)), x[1]);
+                   }});
   cases.push_back({"Tile in blocks",
                    {{2, 4}, {2, 12}},
                    [](Graph* g, const std::vector<Value>& x) { return g->Mul(Tanh(g, x[1]), g->Tile(x[0], 2, 3)); }});

@@ -16,11 +16,15 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
 Bundle SomeBundle(const ModelCase& c) {
-  Bundle bundle = support::UnitBundle(*Model::Create(c.model));
+  data::Normaliser normaliser = support::UnitBundle(*Model::Create(c.model)).normaliser;
+  normaliser.outputs.mean.setConstant(0.3);
+  normaliser.outputs.scale.setConstant(2);
+  ModelSpec spec = c.model;
+  TakeUnits(normaliser, &spec);
+  Bundle bundle = support::UnitBundle(*Model::Create(spec));
+  bundle.normaliser = normaliser;
   bundle.parameters = RandomParameters(bundle.model, 3);
   for (double& value : bundle.parameters) value *= 0.5;  // so that free runs stay bounded
-  bundle.normaliser.outputs.mean.setConstant(0.3);
-  bundle.normaliser.outputs.scale.setConstant(2);
   return bundle;
 }
 
@@ -42,9 +46,10 @@ TEST(PredictTest, TheIncrementScaleIsAFactorOnTheTransitionsLastLayers) {
     const data::Trajectory t = RandomTrajectory(c.model, 15, 2);
     c.model.transition.increment_scale = 0.25;
     const Bundle scaled = SomeBundle(c);
-    c.model.transition.increment_scale = 1;
     Bundle plain = scaled;
-    plain.model = *Model::Create(c.model);
+    ModelSpec unscaled = scaled.model.spec();
+    unscaled.transition.increment_scale = 1;
+    plain.model = *Model::Create(unscaled);
     for (const auto& [block, spec] : {std::pair("transition.", c.model.transition.block),
                                       std::pair("transition_input.", c.model.transition.input_block)}) {
       const std::string last = absl::StrCat(block, spec.hidden_widths.size(), ".");
@@ -95,6 +100,34 @@ TEST(PredictTest, BothModesEqualTheStepFunctions) {
       }
     }
   }
+}
+
+// Weights of any size, in float and double, one step ahead and in free run.
+TEST(PredictTest, WhatIsConstrainedIsInsideWhateverTheWeights) {
+  int64_t checked = 0;
+  for (uint64_t seed = 0; seed < 40; ++seed) {
+    for (ModelCase c : ModelCases()) {
+      if (c.model.state_set.empty() && c.model.output_set.empty()) continue;
+      if (seed % 2 == 0) c.model.precision = Precision::kFloat32;
+      Bundle bundle = SomeBundle(c);
+      base::Rng rng(seed);
+      const double size = std::pow(10.0, rng.Uniform(-3, 4));
+      for (double& parameter : bundle.parameters) parameter = size * rng.Normal();
+      RoundToPrecision(c.model.precision, &bundle.parameters);
+      const data::Trajectory t = RandomTrajectory(c.model, 60, seed);
+      for (const PredictionMode mode : {PredictionMode::kOneStep, PredictionMode::kSimulate}) {
+        const Prediction prediction = *Predict(bundle, t, mode);
+        for (const auto& [set, values] : {std::pair{bundle.model.output_set(), &prediction.outputs}, {bundle.model.state_set(), &prediction.states}}) {
+          for (Index k = c.model.warmup(); set != nullptr && k < values->cols(); ++k) {
+            if (!values->col(k).allFinite()) continue;  // a free run that has left the numbers
+            ASSERT_TRUE(physics::Contains(*set, values->col(k))) << c.name << ", seed " << seed << ", sample " << k;
+            ++checked;
+          }
+        }
+      }
+    }
+  }
+  EXPECT_GT(checked, 5000);
 }
 
 TEST(PredictTest, LongRecordingsAreCutIntoChunksWithoutASeam) {

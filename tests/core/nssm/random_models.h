@@ -60,6 +60,13 @@ inline std::vector<ModelCase> ModelCases() {
       cases.push_back({"Case II, state" + suffix, spec, state});
     }
   }
+  ModelSpec ordered = two;
+  ordered.state_set = {.matrix = {1, -1}, .bounds = {0.4}};
+  cases.push_back({"Case II, ordered states", ordered, state, false});
+  for (ModelSpec boxed : {one, two}) {
+    boxed.output_set = {.matrix = {1, 0, -1, 0, 0, 1, 0, -1}, .bounds = {2, 1, 3, 1}};
+    cases.push_back({boxed.is_case_one() ? "Case I, outputs in a box" : "Case II, outputs in a box", boxed, latent});
+  }
   LossSpec one_step = state;
   one_step.horizon = 1;
   cases.push_back({"Case II, one step", two, one_step});

@@ -1,3 +1,4 @@
+metaekf_test(core/nssm/constraint_spec_test.cc DEPS metaekf::core_nssm)
 metaekf_test(core/nssm/least_squares_test.cc DEPS metaekf::core_nssm)
 metaekf_test(core/nssm/linearise_test.cc DEPS metaekf::core_nssm)
 metaekf_test(core/nssm/loss_test.cc DEPS metaekf::core_nssm)

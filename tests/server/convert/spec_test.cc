@@ -23,6 +23,10 @@ void FillAll(Message* message, int* counter) {
       FillAll(reflection->AddMessage(message, field), counter);
       continue;
     }
+    if (field->is_repeated() && field->cpp_type() == FieldDescriptor::CPPTYPE_DOUBLE) {
+      reflection->AddDouble(message, field, ++*counter / 1024.0);
+      continue;
+    }
     if (field->is_repeated()) {
       reflection->AddUInt32(message, field, static_cast<uint32_t>(++*counter));
       reflection->AddUInt32(message, field, static_cast<uint32_t>(++*counter));
@@ -67,9 +71,12 @@ v1::TrainingSpec FullSpec() {
   model.set_window(1);                                                      // Case II has none
   model.mutable_transition()->clear_input_block();                          // JOINT has none
   model.mutable_transition()->set_input_time(v1::TransitionSpec::CURRENT);  // NEXT is Case I's
-  model.mutable_output_constraint()->mutable_curl_free()->set_position_states(0, 0);
-  model.mutable_output_constraint()->mutable_curl_free()->set_position_states(1, 1);
+  model.mutable_output_constraint()->mutable_curl_free()->add_position_states(0);  // instead of a polyhedron
+  model.mutable_output_constraint()->mutable_curl_free()->add_position_states(1);
   model.set_output_size(2);  // as many as positions
+  auto* polyhedron = model.mutable_state_constraint()->mutable_polyhedron();
+  polyhedron->clear_rays();  // stand instead of the others
+  while (polyhedron->matrix_size() < static_cast<int>(model.state_size())) polyhedron->add_matrix(-1);  // whole rows
   spec.mutable_inner_loop()->set_optimiser(v1::InnerLoopSpec::GRADIENT_DESCENT);  // whose curvature_rates
   spec.set_algorithm(v1::TrainingSpec::FIRST_ORDER_MAML);             // the last learns no rates
   model.set_start(v1::ModelSpec::ENCODED);  // FITTED is Case I's
