@@ -324,7 +324,7 @@ absl::StatusOr<Picture> DrawPrediction(const std::string& label, const Outcome& 
 absl::StatusOr<Picture> DrawErrors(const Results& results, size_t best, const Trajectory& test) {
   plot::BoxPlot picture{.title = "Errors in free run on an unseen multisine", .x_label = "error (mm)"};
   std::vector<std::string> labels = {results.labels[best]};
-  for (const char* other : {"MAML, multisine fleet", "Xfer, multisine fleet", kFromScratchLabel, "ARX(5)"}) {
+  for (const char* other : {"Gaussian prior, multisine fleet", "MAML, multisine fleet", "Xfer, multisine fleet", kFromScratchLabel, "ARX(5)"}) {
     if (labels[0] != other) labels.emplace_back(other);
   }
   for (const std::string& label : labels) {
