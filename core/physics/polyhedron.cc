@@ -22,7 +22,7 @@ namespace {
 constexpr double kZero = 1e-9;          // of products of unit vectors: rays that lie in a constraint's plane
 constexpr double kRank = 1e-10;         // of the largest singular value
 constexpr double kClean = 1e-12;        // elements of rays below it are zero
-constexpr size_t kMostRays = 4096;
+constexpr size_t kMostRays = 1024;  // a row takes a second then, and a specification may come from a stranger
 
 /// A set of constraints.
 class Bits {

@@ -28,7 +28,7 @@ struct Polyhedron {
 ///
 /// @param G  m × n, m may be 0. Rows that say nothing are welcome. @param g  m.
 /// Errors: InvalidArgument if a number is not finite, shapes disagree, the set is empty (naming the first row that excludes all
-/// that the rows before it allow) or needs more than 4,096 rays.
+/// that the rows before it allow) or needs more than 1,024 rays.
 absl::StatusOr<Polyhedron> MakePolyhedron(const Eigen::MatrixXd& G, const Eigen::VectorXd& g);
 
 /// The cone of all R μ, μ ≥ 0, with the G that describes it. @param R  n × r; rays that others make up are left out.
