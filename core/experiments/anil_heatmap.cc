@@ -126,11 +126,7 @@ Table ToTable(const std::vector<std::string>& labels, const std::vector<std::vec
   return table;
 }
 
-/// Mean over runs; infinite if one of them failed.
-double MeanOf(const Table& table, size_t row, size_t column) {
-  const Statistics s = Summarise(table.rows[row].cells[column], false);
-  return s.failed == 0 ? s.mean : std::numeric_limits<double>::infinity();
-}
+double MeanOf(const Table& table, size_t row, size_t column) { return MeanUnlessFailed(table.rows[row].cells[column]); }
 
 /// Index of the row with the least (or greatest) mean in a column, among the first rows.
 size_t Extreme(const Table& table, size_t rows, size_t column, bool least) {

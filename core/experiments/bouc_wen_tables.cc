@@ -258,12 +258,6 @@ Table Times(const Results& results, const Scale& scale) {
   return table;
 }
 
-/// Mean over runs; infinite if one of them failed.
-double MeanUnlessFailed(const std::vector<double>& runs) {
-  const Statistics s = Summarise(runs, false);
-  return s.runs > 0 && s.failed == 0 ? s.mean : std::numeric_limits<double>::infinity();
-}
-
 /// The model with the least mean error in free run after the longest context.
 size_t BestModel(const Table& rmse) {
   const auto mean = [](const Row& row) { return MeanUnlessFailed(row.cells.back()); };

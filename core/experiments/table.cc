@@ -81,6 +81,11 @@ Statistics Summarise(const std::vector<double>& runs, bool larger_is_better) {
   return s;
 }
 
+double MeanUnlessFailed(const std::vector<double>& runs) {
+  const Statistics s = Summarise(runs, false);
+  return s.runs > 0 && s.failed == 0 ? s.mean : std::numeric_limits<double>::infinity();
+}
+
 std::string ToText(const Table& table) {
   std::vector<std::vector<std::string>> cells(1, {table.row_heading});
   for (const Column& column : table.columns) cells[0].push_back(Heading(column));

@@ -44,6 +44,9 @@ struct Statistics {
   double lower_quartile = 0, median = 0, upper_quartile = 0;
 };
 
+/// Mean of runs to rank by: infinite if there is none, or one has failed.
+double MeanUnlessFailed(const std::vector<double>& runs);
+
 Statistics Summarise(const std::vector<double>& runs, bool larger_is_better);
 
 /// Aligned text for people, and CSV with every statistic: one line per row and column.

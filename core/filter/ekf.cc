@@ -155,6 +155,7 @@ absl::Status Ekf::Step(const Ref<const VectorXd>& input, const Ref<const VectorX
   ++state_.samples;
   state_.last_input = u_;
   MeasurementUpdate(scratch, estimate);
+  estimate->slack = estimate->projection = kNaN;
   if (normalised_set_ && state_.mean.allFinite() && state_.factor.allFinite()) {
     const ConstraintEffect effect = Constrain(*normalised_set_, &state_.mean, &state_.factor);
     estimate->slack = effect.slack;

@@ -109,6 +109,7 @@ void ReadStateConstraint(JsonFields* parent, ModelSpec* spec) {
 void ReadConstraint(JsonFields* parent, ModelSpec* spec) {
   JsonFields fields = parent->Object("output_constraint");
   spec->output_set = ReadPolyhedron(&fields, spec->output_size);
+  if (fields.Has("curl_free") && fields.Has("polyhedron")) fields.Fail("polyhedron", "stands instead of curl_free, not beside it");
   if (fields.Has("curl_free")) {
     JsonFields curl_free = fields.Object("curl_free");
     spec->curl_free_positions = curl_free.Integers("position_states", 0, kLargestWidth);

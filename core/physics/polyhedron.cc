@@ -224,8 +224,12 @@ absl::StatusOr<Polyhedron> MakePolyhedron(const MatrixXd& G, const VectorXd& g) 
   }
   METAEKF_ASSIGN_OR_RETURN(Polyhedron set, Generate(G, g));
   if (set.vertices.cols() == 0) {
+    const auto leaves_something = [&](Index rows) {
+      const absl::StatusOr<Polyhedron> part = Generate(G.topRows(rows), g.head(rows));
+      return !part.ok() || part->vertices.cols() > 0;  // what has too many rays is not empty
+    };
     Index rows = 1;
-    while (Generate(G.topRows(rows), g.head(rows))->vertices.cols() > 0) ++rows;
+    while (rows < G.rows() && leaves_something(rows)) ++rows;
     return absl::InvalidArgumentError(absl::StrCat("the constraint leaves nothing: its row ", rows,
                                                    " excludes all that the rows before it allow"));
   }

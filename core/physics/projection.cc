@@ -139,6 +139,7 @@ Projection Project(const Polyhedron& set, const VectorXd& z, const MatrixXd& cov
 }
 
 VectorXd Inside(const Polyhedron& set, const VectorXd& x) {
+  if (Contains(set, x)) return x;
   return Project(set, x, MatrixXd::Identity(x.size(), x.size())).point;
 }
 

@@ -42,6 +42,12 @@ TEST(TableTest, FailedRunsAreTheWorst) {
   EXPECT_EQ(Summarise({kInfinity, kInfinity, 1}, false).median, kInfinity);
 }
 
+TEST(TableTest, WhoHasFailedOnceRanksLast) {
+  EXPECT_EQ(MeanUnlessFailed({1, 3}), 2);
+  EXPECT_TRUE(std::isinf(MeanUnlessFailed({1, std::nan("")})));
+  EXPECT_TRUE(std::isinf(MeanUnlessFailed({})));
+}
+
 TEST(TableTest, OfNoRunsThereIsNothingToSay) {
   EXPECT_TRUE(std::isnan(Summarise({}, false).median));
   EXPECT_TRUE(std::isnan(Summarise({kInfinity}, false).mean));

@@ -35,6 +35,8 @@ TEST(ConstraintSpecTest, WhatIsWrongIsNamed) {
   EXPECT_THAT(message(state({{"matrix", {1, 2}}, {"bounds", {1, 2}}})), HasSubstr("bounds: 2 for 1 rows"));
   EXPECT_THAT(message(state({{"matrix", {1, 0, -1, 0}}, {"bounds", {1, -2}}})), HasSubstr("row 2 excludes"));
   EXPECT_THAT(message(state({{"matrix", {1, 0}}, {"rays", {1, 0}}})), HasSubstr("model.state_constraint.polyhedron.rays"));
+  const json both = {{"curl_free", {{"position_states", {0, 1}}}}, {"polyhedron", {{"matrix", {1}}}}};
+  EXPECT_THAT(message({{"output_constraint", both}}), HasSubstr("model.output_constraint.polyhedron: stands instead of curl_free"));
   EXPECT_THAT(message(state(json::object())), HasSubstr("model.state_constraint.polyhedron.matrix"));
   EXPECT_THAT(message({{"state_constraint", {{"curl_free", {{"position_states", {0, 1}}}}}}}), HasSubstr("model.state_constraint.curl_free"));
   EXPECT_THAT(message({{"case", "INPUT_OUTPUT"}, {"state_size", 0}, {"state_constraint", {{"polyhedron", {{"rays", {1}}}}}}}),
