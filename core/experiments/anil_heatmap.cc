@@ -159,9 +159,11 @@ std::vector<std::string> Findings(const Table& table, size_t learners) {
                        " learners are better with 50 % than with 10 %.")};
 }
 
-absl::StatusOr<Picture> Draw(const Table& table) {
+/// @param learners  rows from the first whose values the colours compare; a failing ARX has the darkest.
+absl::StatusOr<Picture> Draw(const Table& table, size_t learners) {
   plot::HeatMap map{.title = "RMSE in a free run of 10 s, mean over runs; empty where one failed", .x_label = "share of the target's data adapted to",
-                    .values = Eigen::MatrixXd(table.rows.size(), table.columns.size()), .logarithmic = true};
+                    .values = Eigen::MatrixXd(table.rows.size(), table.columns.size()), .logarithmic = true,
+                    .scale_rows = static_cast<Eigen::Index>(learners)};
   for (const Column& column : table.columns) map.columns.push_back(column.name);
   for (size_t row = 0; row < table.rows.size(); ++row) {
     map.rows.push_back(table.rows[row].label);
@@ -217,7 +219,7 @@ absl::StatusOr<Report> Run(const Options& options, base::Executor* executor, con
   Table table = ToTable(labels, errors, scale.runs);
   Table times{.name = "times", .title = "Processor time", .row_heading = "learner", .columns = {{"training", "s"}}};
   for (size_t i = 0; i < learners.size(); ++i) times.rows.push_back({learners[i].label, {seconds[i]}});
-  METAEKF_ASSIGN_OR_RETURN(Picture picture, Draw(table));
+  METAEKF_ASSIGN_OR_RETURN(Picture picture, Draw(table, learners.size()));
   std::vector<std::string> findings = Findings(table, learners.size());
   return Report{{std::move(table), std::move(times)}, std::move(findings), {std::move(picture)}};
 }

@@ -36,12 +36,13 @@ std::string ColourAt(double share) {
 class Scale {
  public:
   explicit Scale(const HeatMap& map) : logarithmic_(map.logarithmic) {
-    for (const double value : map.values.reshaped()) {
+    const Eigen::Index rows = map.scale_rows > 0 ? std::min(map.scale_rows, map.values.rows()) : map.values.rows();
+    for (const double value : map.values.topRows(rows).reshaped()) {
       if (IsShown(value, logarithmic_)) range_.Add(Position(value));
     }
   }
   double Share(double value) const {
-    return range_.max > range_.min ? (Position(value) - range_.min) / (range_.max - range_.min) : 0;
+    return range_.max > range_.min ? std::clamp((Position(value) - range_.min) / (range_.max - range_.min), 0.0, 1.0) : 0;
   }
 
  private:

@@ -15,6 +15,8 @@ struct HeatMap {
   std::vector<std::string> columns, rows;
   Eigen::MatrixXd values;  ///< rows × columns; what is not finite, or has no logarithm, stays blank
   bool logarithmic = false;  ///< the colour scale
+  /// Rows from the first whose values span the colour scale, 0 all; what lies beyond has the scale's end.
+  Eigen::Index scale_rows = 0;
 };
 
 /// `map` as an SVG document of its own. Same map, same text.

@@ -8,7 +8,9 @@
 #include "core/base/numbers.h"
 #include "core/base/status.h"
 #include "core/sim/bouc_wen.h"
+#include "core/sim/magnetic_localization.h"
 #include "core/sim/van_der_pol.h"
+#include "core/sim/vapor_compression.h"
 
 namespace metaekf::sim {
 namespace {
@@ -84,7 +86,8 @@ std::vector<double> DrawParameters(const System& system, const Request& request,
 }  // namespace
 
 const std::vector<const System*>& Systems() {
-  static const std::vector<const System*> systems = {&VanDerPol(), &BoucWen()};
+  static const std::vector<const System*> systems = {&VanDerPol(), &BoucWen(), &VaporCompression(),
+                                                     &MagneticLocalization()};
   return systems;
 }
 

@@ -36,6 +36,19 @@ TEST(HeatMapTest, TheLeastIsLightestAndTheGreatestDarkest) {
   for (const char* colour : {"#fff6cc", "#3a0f5c", "#dd785d"}) EXPECT_THAT(*svg, HasSubstr(colour));
 }
 
+TEST(HeatMapTest, TheFirstRowsMaySpanTheScale) {
+  HeatMap map{.columns = {"1", "2"}, .rows = {"a", "b"}, .values = Eigen::Matrix2d{{1, 2}, {1000, 0}}, .scale_rows = 1};
+  const auto svg = RenderSvg(map);
+  ASSERT_TRUE(svg.ok()) << svg.status();
+  const auto count = [&](const std::string& colour) {
+    size_t found = 0;
+    for (size_t at = svg->find(colour); at != std::string::npos; at = svg->find(colour, at + 1)) ++found;
+    return found;
+  };
+  EXPECT_EQ(count("#fff6cc"), 2U);  // 1 and what is below it
+  EXPECT_EQ(count("#3a0f5c"), 2U);  // 2 and what is above it
+}
+
 TEST(HeatMapTest, ValuesThatAreAllTheSameAreNoError) {
   HeatMap map{.columns = {"1"}, .rows = {"a"}, .values = Eigen::MatrixXd::Constant(1, 1, 3)};
   EXPECT_TRUE(RenderSvg(map).ok());
