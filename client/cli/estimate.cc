@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <cmath>
 #include <fstream>
 
@@ -22,6 +23,10 @@ struct Flags {
   client::Target target;
   std::string data = "-", out = "-", plot, noise;
   DataFlags columns;
+  double gate = -1;  // not given
+  int32_t recover_after = 0;
+  bool stay_diverged = false;
+  double max_lag_s = 0;
 };
 
 /// What is kept of the estimates for the plot.
@@ -32,7 +37,7 @@ struct History {
 
 /// What is said of a run.
 struct Summary {
-  uint64_t samples = 0, missing = 0, gated = 0, nis_count = 0;
+  uint64_t samples = 0, missing = 0, gated = 0, delayed = 0, reset = 0, nis_count = 0;
   double nis_sum = 0;
   client::Health health = client::Health::kUnknown;
 
@@ -41,6 +46,8 @@ struct Summary {
       ++samples;
       missing += (batch.flags[i] & client::kMissing) != 0;
       gated += (batch.flags[i] & client::kGated) != 0;
+      delayed += (batch.flags[i] & client::kDelayed) != 0;
+      reset += (batch.flags[i] & client::kReset) != 0;
       if (!std::isnan(batch.nis[i])) {
         nis_sum += batch.nis[i];
         ++nis_count;
@@ -113,6 +120,7 @@ absl::StatusOr<SampleSender> OpenData(const Flags& flags, const TargetModel& mod
                                       Console& console) {
   METAEKF_ASSIGN_OR_RETURN(data::CsvOptions columns, ModelColumns(flags.columns, model, false));
   columns.allow_missing_outputs = true;
+  columns.allow_any_times = flags.max_lag_s > 0;
   // States are not sent; where there are any, the plot shows them.
   if (!flags.plot.empty()) columns.states = FreeColumns(flags.columns).states;
   SampleSender::Options options{.columns = columns, .keep_rows = !flags.plot.empty()};
@@ -131,6 +139,8 @@ void PrintSummary(Console& console, const Summary& summary, const client::Sessio
   PrintRecord(console, {{"samples", summary.samples},
                         {"missing", summary.missing},
                         {"gated", summary.gated},
+                        {"delayed", summary.delayed},
+                        {"reset", summary.reset},
                         {"mean_nis", summary.nis_sum / nis_count},
                         {"expected_nis", info.output_size},
                         {"health", HealthWord(summary.health)},
@@ -142,6 +152,9 @@ absl::Status Estimate(const Flags& flags, Console& console) {
   client::EstimationOptions options{.target = flags.target,
                                     .sample_period_s = flags.columns.sample_period_s,
                                     .max_in_flight = kMaxInFlight};
+  options.gate = {.probability = std::max(0.0, flags.gate), .recover_after = flags.recover_after, .off = flags.gate == 0};
+  options.stay_diverged = flags.stay_diverged;
+  options.max_lag_s = flags.max_lag_s;
   if (!flags.noise.empty()) {
     METAEKF_ASSIGN_OR_RETURN(const std::string text, ReadFile(flags.noise));
     METAEKF_ASSIGN_OR_RETURN(options.noise, ToAbsl(client::ParseNoiseSettings(text, flags.noise)));
@@ -192,6 +205,16 @@ void AddEstimate(CLI::App& app, Console& console, Command& chosen) {
   command->add_option("--plot", flags->plot, "SVG file: estimates with bands of two sigma");
   command->add_option("--noise", flags->noise,
                       "NoiseSettings as protobuf text: Q, R, initial mean and covariance");
+  command->add_option("--gate", flags->gate,
+                      "Probability with which a right measurement passes the outlier gate (default 0.999999); 0: no gate")
+      ->check(CLI::Range(0.0, 0.999999999999));
+  command->add_option("--recover-after", flags->recover_after,
+                      "Samples with outliers in a row after which they are believed (default 5)")
+      ->check(CLI::PositiveNumber);
+  command->add_flag("--stay-diverged", flags->stay_diverged, "Do not begin anew after a divergence");
+  command->add_option("--max-lag-s", flags->max_lag_s,
+                      "How late a measurement may be: rows with an earlier t than the latest are applied at their own time")
+      ->check(CLI::NonNegativeNumber);
   flags->columns.AddTo(command);
   OnChosen(command, chosen, [flags, &console] { return Estimate(*flags, console); });
 }

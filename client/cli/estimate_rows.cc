@@ -49,8 +49,10 @@ const char* HealthWord(client::Health health) {
       return "warming_up";
     case client::Health::kConsistent:
       return "consistent";
-    case client::Health::kInconsistent:
-      return "inconsistent";
+    case client::Health::kOverconfident:
+      return "overconfident";
+    case client::Health::kUnderconfident:
+      return "underconfident";
     case client::Health::kDiverged:
       return "diverged";
     case client::Health::kUnknown:

@@ -216,7 +216,7 @@ EstimateBatch FromProto(const v1::EstimateBatch& message) {
                       .projections = ToVector(message.projections())};
   for (const int health : message.health()) {
     // The numbers are the same on both sides.
-    batch.health.push_back(health <= v1::EstimateBatch::DIVERGED ? static_cast<Health>(health)
+    batch.health.push_back(health <= v1::EstimateBatch::UNDERCONFIDENT ? static_cast<Health>(health)
                                                                  : Health::kUnknown);
   }
   return batch;

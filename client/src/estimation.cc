@@ -88,7 +88,13 @@ Result<v1::SampleBatch> EstimationSession::Impl::ToMessage(const SampleBatch& sa
   if (!samples.times_s.empty() && samples.times_s.size() != count) {
     return wrong("times", samples.times_s.size(), 1);
   }
+  const size_t noise = samples.measurement_noise_covs.size(), n_y = info.output_size;
+  if (noise != 0 && noise != count * n_y && noise != count * n_y * (n_y + 1) / 2) {
+    return wrong("measurement noise", noise, n_y);
+  }
   v1::SampleBatch message;
+  message.mutable_measurement_noise_covs()->Add(samples.measurement_noise_covs.begin(),
+                                                samples.measurement_noise_covs.end());
   message.mutable_inputs()->Add(samples.inputs.begin(), samples.inputs.end());
   message.mutable_outputs()->Add(samples.outputs.begin(), samples.outputs.end());
   message.mutable_times_s()->Add(samples.times_s.begin(), samples.times_s.end());
@@ -213,6 +219,10 @@ Result<std::unique_ptr<EstimationSession>> Client::OpenEstimation(
   open->set_send_innovations(options.send_innovations);
   open->set_sample_period_s(options.sample_period_s);
   open->set_max_lag_s(options.max_lag_s);
+  open->mutable_gate()->set_probability(options.gate.probability);
+  open->mutable_gate()->set_recover_after(options.gate.recover_after);
+  open->mutable_gate()->set_off(options.gate.off);
+  open->set_stay_diverged(options.stay_diverged);
 
   auto impl = std::make_unique<EstimationSession::Impl>();
   impl->client = impl_;

@@ -124,7 +124,9 @@ absl::StatusOr<bool> CsvRowReader::Next(CsvRow& row) {
   if (time_column_ >= 0) {
     METAEKF_ASSIGN_OR_RETURN(row.time_s, lines_.Number(time_column_));
     if (std::isnan(row.time_s)) return lines_.Error(time_column_, "a time is missing here");
-    if (absl::Status even = time_.Add(lines_.cells()[time_column_], row.time_s); !even.ok()) {
+    if (options_.allow_any_times) {
+      if (!std::isfinite(row.time_s)) return lines_.Error(time_column_, "a time must be finite");
+    } else if (absl::Status even = time_.Add(lines_.cells()[time_column_], row.time_s); !even.ok()) {
       return lines_.Error(time_column_, std::string(even.message()));
     }
   }

@@ -23,6 +23,7 @@ struct CsvOptions {
   std::optional<std::vector<std::string>> inputs, outputs, states;
   /// Accepts an empty cell or NaN in an output: a value that was not measured.
   bool allow_missing_outputs = false;
+  bool allow_any_times = false;  ///< for streams whose samples may be missing or late
   /// Sample period of trajectories where the file does not tell it; 0 if unknown. For ReadCsv.
   double fallback_sample_period_s = 0;
 };

@@ -5,6 +5,7 @@
 
 #include "core/base/numbers.h"
 #include "core/base/status.h"
+#include "core/filter/chi_squared.h"
 #include "core/filter/constrain.h"
 #include "core/filter/square_root.h"
 #include "core/physics/projection.h"
@@ -18,11 +19,6 @@ using Eigen::Ref;
 using Eigen::VectorXd;
 
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
-
-// The NIS of one component is χ² with one degree of freedom: mean 1, variance 2. A running mean with weight 1/100 has
-// standard deviation √(2/199) ≈ 0.1; outside [0.5, 2] it is five of them or more away from 1.
-constexpr double kNisWeight = 0.01;
-constexpr double kNisLow = 0.5, kNisHigh = 2;
 
 /// A ← D⁻¹ A D⁻¹: a covariance from physical to normalised units.
 MatrixXd Normalised(const MatrixXd& cov, const VectorXd& scale) {
@@ -51,6 +47,18 @@ absl::Status CheckSize(const std::string& name, const MatrixXd& matrix, Index n)
 
 }  // namespace
 
+/// R in normalised units. Errors: InvalidArgument if it is not n_y × n_y and positive definite.
+absl::StatusOr<MatrixXd> NormalisedNoise(const MatrixXd& R, const VectorXd& scale) {
+  METAEKF_RETURN_IF_ERROR(CheckSize("measurement noise covariance R", R, scale.size()));
+  const MatrixXd normalised = Normalised(R, scale);
+  const absl::StatusOr<MatrixXd> factor = SemidefiniteFactor(normalised);
+  if (!factor.ok()) return base::Annotate(factor.status(), "measurement noise covariance R");
+  if (factor->size() > 0 && factor->diagonal().minCoeff() <= 0) {
+    return absl::InvalidArgumentError("measurement noise covariance R: must be positive definite");
+  }
+  return normalised;
+}
+
 absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<const FilterModel> model,
                                 std::shared_ptr<const FilterModel::Parameters> parameters,
                                 const FilterOptions& options) {
@@ -77,7 +85,6 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
   const MatrixXd R = options.measurement_cov.value_or(bundle.noise.measurement);
   const MatrixXd P = options.initial_cov.value_or(bundle.noise.initial);
   METAEKF_RETURN_IF_ERROR(CheckSize("process noise covariance Q", Q, n));
-  METAEKF_RETURN_IF_ERROR(CheckSize("measurement noise covariance R", R, n_y));
   METAEKF_RETURN_IF_ERROR(CheckSize("initial covariance", P, n));
   const auto factor = [](const std::string& name, const MatrixXd& cov) -> absl::StatusOr<MatrixXd> {
     absl::StatusOr<MatrixXd> result = SemidefiniteFactor(cov);
@@ -86,21 +93,28 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
   };
   METAEKF_ASSIGN_OR_RETURN(ekf.process_factor_, factor("process noise covariance Q", Normalised(Q, state_scale)));
   METAEKF_ASSIGN_OR_RETURN(ekf.initial_factor_, factor("initial covariance", Normalised(P, state_scale)));
-  ekf.measurement_cov_ = Normalised(R, bundle.normaliser.outputs.scale);
-  METAEKF_ASSIGN_OR_RETURN(const MatrixXd R_factor, factor("measurement noise covariance R", ekf.measurement_cov_));
-  if (R_factor.size() > 0 && R_factor.diagonal().minCoeff() <= 0) {
-    return absl::InvalidArgumentError("measurement noise covariance R: must be positive definite");
-  }
+  METAEKF_ASSIGN_OR_RETURN(ekf.measurement_cov_, NormalisedNoise(R, bundle.normaliser.outputs.scale));
 
-  ekf.state_.mean = VectorXd::Zero(n);
+  ekf.initial_mean_ = VectorXd::Zero(n);
   if (options.initial_mean) {
     if (ekf.case_one_) return absl::InvalidArgumentError("initial mean: in Case I the first window gives the latent");
     if (options.initial_mean->size() != n || !options.initial_mean->allFinite()) {
       return absl::InvalidArgumentError(absl::StrCat("initial mean: expected ", n, " finite numbers, got ",
                                                      options.initial_mean->size()));
     }
-    ekf.state_.mean = bundle.normaliser.states.Normalise(*options.initial_mean);
+    ekf.initial_mean_ = bundle.normaliser.states.Normalise(*options.initial_mean);
   }
+  if (!(options.gate.probability >= 0 && options.gate.probability < 1) || options.gate.recover_after < 1) {
+    return absl::InvalidArgumentError(
+        absl::StrCat("gate: a probability from 0 to below 1 and at least 1 sample are needed, got ",
+                     base::FormatShort(options.gate.probability), " and ", options.gate.recover_after));
+  }
+  for (Index m = 1; options.gate.probability > 0 && m <= n_y; ++m) {
+    ekf.gate_limits_.push_back(ChiSquaredQuantile(1 - options.gate.probability, static_cast<double>(m)));
+  }
+  ekf.recover_after_ = options.gate.recover_after;
+  ekf.restart_after_divergence_ = options.restart_after_divergence;
+  ekf.state_.mean = ekf.initial_mean_;
   ekf.state_.factor = ekf.initial_factor_;
   ekf.state_.last_input = VectorXd::Zero(ekf.input_size_);
   ekf.state_.window.reserve(ekf.window_size_);
@@ -108,7 +122,9 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
   ekf.y_.resize(n_y);
   ekf.value_.resize(n);
   ekf.h_.resize(n_y);
-  ekf.innovation_.resize(n_y);
+  ekf.whitened_.resize(n_y);
+  ekf.measured_.reserve(static_cast<size_t>(n_y));
+  ekf.prior_factor_.resize(n, n);
   ekf.F_.resize(n, n);
   ekf.H_.resize(n_y, n);
   ekf.H_rows_.resize(n_y, n);
@@ -127,7 +143,7 @@ Estimate Ekf::MakeEstimate() const {
 }
 
 absl::Status Ekf::Step(const Ref<const VectorXd>& input, const Ref<const VectorXd>& output,
-                       FilterModel::Scratch* scratch, Estimate* estimate) {
+                       FilterModel::Scratch* scratch, Estimate* estimate, const MatrixXd* measurement_cov) {
   if (input.size() != input_size_ || output.size() != output_size_) {
     return absl::InvalidArgumentError(absl::StrCat("a sample has ", input_size_, " inputs and ", output_size_,
                                                    " outputs, got ", input.size(), " and ", output.size()));
@@ -137,24 +153,30 @@ absl::Status Ekf::Step(const Ref<const VectorXd>& input, const Ref<const VectorX
       return absl::InvalidArgumentError(absl::StrCat("input ", i + 1, " is ", base::FormatExact(input[i])));
     }
   }
-  const bool filling = case_one_ && state_.window.size() < window_size_;
   for (Index i = 0; i < output_size_; ++i) {
     if (std::isinf(output[i])) {
       return absl::InvalidArgumentError(absl::StrCat("output ", i + 1, " is ", base::FormatExact(output[i])));
     }
   }
+  std::optional<MatrixXd> R;
+  if (measurement_cov != nullptr) {
+    METAEKF_ASSIGN_OR_RETURN(R, NormalisedNoise(*measurement_cov, normaliser_.outputs.scale));
+  }
+  estimate->reset = state_.diverged && restart_after_divergence_;
+  if (estimate->reset) Restart();
   u_ = (input - normaliser_.inputs.mean).cwiseQuotient(normaliser_.inputs.scale);
   y_ = (output - normaliser_.outputs.mean).cwiseQuotient(normaliser_.outputs.scale);
-  if (filling) {
+  if (warming_up()) {
     FillWindow(scratch);
     // The window's last sample is the first with a latent; its measurement has been used by the encoder.
     y_.setConstant(kNaN);
-  } else if (state_.samples > 0) {
+  } else if (state_.started) {
     TimeUpdate(scratch);
   }
+  state_.started = true;
   ++state_.samples;
   state_.last_input = u_;
-  MeasurementUpdate(scratch, estimate);
+  MeasurementUpdate(R ? *R : measurement_cov_, scratch, estimate);
   estimate->slack = estimate->projection = kNaN;
   if (normalised_set_ && state_.mean.allFinite() && state_.factor.allFinite()) {
     const ConstraintEffect effect = Constrain(*normalised_set_, &state_.mean, &state_.factor);
@@ -166,8 +188,31 @@ absl::Status Ekf::Step(const Ref<const VectorXd>& input, const Ref<const VectorX
   return absl::OkStatus();
 }
 
+void Ekf::Restart() {
+  state_.mean = initial_mean_;
+  state_.factor = initial_factor_;
+  state_.window.clear();
+  state_.nis = {};
+  state_.gated_in_row = 0;
+  state_.started = state_.diverged = false;
+}
+
 VectorXd Ekf::LastInput() const {
   return state_.last_input.cwiseProduct(normaliser_.inputs.scale) + normaliser_.inputs.mean;
+}
+
+MatrixXd Ekf::MeasurementNoise() const {
+  return normaliser_.outputs.scale.asDiagonal() * measurement_cov_ * normaliser_.outputs.scale.asDiagonal();
+}
+
+absl::StatusOr<std::vector<Estimate>> Ekf::Forecast(const MatrixXd& inputs, FilterModel::Scratch* scratch) const {
+  Ekf ahead = *this;
+  const VectorXd nothing = VectorXd::Constant(output_size_, kNaN);
+  std::vector<Estimate> estimates(static_cast<size_t>(inputs.cols()), MakeEstimate());
+  for (Index t = 0; t < inputs.cols(); ++t) {
+    METAEKF_RETURN_IF_ERROR(ahead.Step(inputs.col(t), nothing, scratch, &estimates[static_cast<size_t>(t)]));
+  }
+  return estimates;
 }
 
 void Ekf::FillWindow(FilterModel::Scratch* scratch) {
@@ -189,63 +234,101 @@ void Ekf::TimeUpdate(FilterModel::Scratch* scratch) {
   state_.mean = value_;
 }
 
-void Ekf::MeasurementUpdate(FilterModel::Scratch* scratch, Estimate* estimate) {
+void Ekf::MeasurementUpdate(const MatrixXd& R, FilterModel::Scratch* scratch, Estimate* estimate) {
   estimate->innovation.setConstant(kNaN);
   estimate->innovation_cov.setConstant(kNaN);
   estimate->nis = kNaN;
-  estimate->measured = 0;
-  const auto measured_row = [this](Index i) { return !std::isnan(y_[i]); };
-  for (Index i = 0; i < output_size_; ++i) estimate->measured += measured_row(i) ? 1 : 0;
-  if (estimate->measured == 0) return;
+  estimate->gated = 0;
+  measured_.clear();
+  for (Index i = 0; i < output_size_; ++i) {
+    if (!std::isnan(y_[i])) measured_.push_back(i);
+  }
+  estimate->measured = static_cast<int>(measured_.size());
+  if (measured_.empty()) return;
 
   model_->Measurement(*parameters_, state_.mean, u_, &h_, &H_, scratch);
-  const Index m = estimate->measured, n = state_size_;
+  prior_factor_ = state_.factor;
+  estimate->nis = UpdateFactor(measured_, R);
+  WriteInnovation(estimate);
+  const size_t m = measured_.size();
+  const bool outliers = !gate_limits_.empty() && !(estimate->nis <= gate_limits_[m - 1] * std::max(1.0, state_.nis.Ratio()));
+  if (!outliers || !state_.mean.allFinite()) {
+    state_.gated_in_row = 0;
+    state_.nis.Add(estimate->nis, estimate->measured);
+    return MoveMean();
+  }
+  state_.factor = prior_factor_;
+  LeaveOutliersOut(R, estimate);
+}
+
+double Ekf::UpdateFactor(const std::vector<Index>& rows, const MatrixXd& R) {
+  const Index m = static_cast<Index>(rows.size()), n = state_size_;
   auto work = update_work_.topLeftCorner(m + n, m + n);
-  Index row = 0;
-  for (Index i = 0; i < output_size_; ++i) {
-    if (!measured_row(i)) continue;
-    H_rows_.row(row) = H_.row(i);
-    innovation_[row] = y_[i] - h_[i];
-    Index col = 0;
-    for (Index j = 0; j < output_size_; ++j) {
-      if (measured_row(j)) work(row, col++) = measurement_cov_(i, j);
-    }
-    ++row;
+  for (Index i = 0; i < m; ++i) {
+    const Index row = rows[static_cast<size_t>(i)];
+    H_rows_.row(i) = H_.row(row);
+    whitened_[i] = y_[row] - h_[row];
+    for (Index j = 0; j < m; ++j) work(i, j) = R(row, rows[static_cast<size_t>(j)]);
   }
   CholeskyInPlace(work.topLeftCorner(m, m));
   FactorMeasurementUpdate(H_rows_.topRows(m), work, &state_.factor);
-
-  // K ỹ = (K S^½)(S^−½ ỹ), and the NIS is the squared length of S^−½ ỹ.
-  auto whitened = innovation_.head(m);
-  estimate->nis = 0;
-  Index at = 0;
-  for (Index i = 0; i < output_size_; ++i) {
-    if (measured_row(i)) estimate->innovation[i] = whitened[at++] * normaliser_.outputs.scale[i];
-  }
+  updated_ = m;
+  double nis = 0;
   for (Index i = 0; i < m; ++i) {
-    for (Index j = 0; j < i; ++j) whitened[i] -= work(i, j) * whitened[j];
-    whitened[i] /= work(i, i);
-    estimate->nis += whitened[i] * whitened[i];
+    for (Index j = 0; j < i; ++j) whitened_[i] -= work(i, j) * whitened_[j];
+    whitened_[i] /= work(i, i);
+    nis += whitened_[i] * whitened_[i];
   }
-  for (Index j = 0; j < m; ++j) state_.mean += work.col(j).tail(n) * whitened[j];
-  // S back in physical units, at the rows and columns that were measured.
-  Index s_row = 0;
-  for (Index i = 0; i < output_size_; ++i) {
-    if (!measured_row(i)) continue;
-    Index s_col = 0;
-    for (Index j = 0; j < output_size_; ++j) {
-      if (!measured_row(j)) continue;
+  return nis;
+}
+
+void Ekf::MoveMean() {
+  const auto work = update_work_.topLeftCorner(updated_ + state_size_, updated_);
+  for (Index j = 0; j < updated_; ++j) state_.mean += work.col(j).tail(state_size_) * whitened_[j];
+}
+
+void Ekf::WriteInnovation(Estimate* estimate) const {
+  const VectorXd& scale = normaliser_.outputs.scale;
+  for (Index i = 0; i < updated_; ++i) {
+    const Index row = measured_[static_cast<size_t>(i)];
+    estimate->innovation[row] = (y_[row] - h_[row]) * scale[row];
+    for (Index j = 0; j < updated_; ++j) {
+      const Index col = measured_[static_cast<size_t>(j)];
       double sum = 0;
-      for (Index k = 0; k <= std::min(s_row, s_col); ++k) sum += work(s_row, k) * work(s_col, k);
-      estimate->innovation_cov(i, j) = sum * normaliser_.outputs.scale[i] * normaliser_.outputs.scale[j];
-      ++s_col;
+      for (Index k = 0; k <= std::min(i, j); ++k) sum += update_work_(i, k) * update_work_(j, k);
+      estimate->innovation_cov(row, col) = sum * scale[row] * scale[col];
     }
-    ++s_row;
   }
 }
 
+void Ekf::LeaveOutliersOut(const MatrixXd& R, Estimate* estimate) {
+  const VectorXd innovation = (y_ - h_)(measured_);
+  const MatrixXd predicted = H_(measured_, Eigen::all) * prior_factor_;
+  const MatrixXd predicted_cov = predicted * predicted.transpose(), R_measured = R(measured_, measured_);
+  if (state_.gated_in_row >= recover_after_) {
+    state_.gated_in_row = 0;
+    estimate->reset = true;
+    state_.nis.Add(estimate->nis, estimate->measured);
+    state_.factor *= std::sqrt(WideningFor(innovation, predicted_cov, R_measured));
+    UpdateFactor(measured_, R);
+    return MoveMean();
+  }
+  ++state_.gated_in_row;
+  std::vector<double> limits = gate_limits_;
+  for (double& limit : limits) limit *= std::max(1.0, state_.nis.Ratio());
+  const std::vector<Index> outliers = Outliers(innovation, predicted_cov + R_measured, limits);
+  estimate->gated = static_cast<int>(outliers.size());
+  std::vector<Index> kept;
+  for (size_t i = 0; i < measured_.size(); ++i) {
+    if (!std::binary_search(outliers.begin(), outliers.end(), static_cast<Index>(i))) kept.push_back(measured_[i]);
+  }
+  if (kept.empty()) return;
+  state_.nis.Add(UpdateFactor(kept, R), static_cast<int>(kept.size()));
+  MoveMean();
+}
+
 void Ekf::WriteEstimate(FilterModel::Scratch* scratch, Estimate* estimate) {
-  if (case_one_ && state_.window.size() < window_size_) {
+  if (warming_up()) {
     estimate->mean.setConstant(kNaN);
     estimate->cov.setConstant(kNaN);
     return;
@@ -268,17 +351,8 @@ void Ekf::WriteEstimate(FilterModel::Scratch* scratch, Estimate* estimate) {
 }
 
 void Ekf::JudgeHealth(Estimate* estimate) {
-  if (case_one_ && state_.window.size() < window_size_) {
-    estimate->health = Health::kWarmingUp;
-    return;
-  }
   if (!state_.mean.allFinite() || !state_.factor.allFinite()) state_.diverged = true;
-  if (estimate->measured > 0) {
-    state_.nis_ratio += kNisWeight * (estimate->nis / estimate->measured - state_.nis_ratio);
-  }
-  estimate->health = state_.diverged                                                  ? Health::kDiverged
-                     : state_.nis_ratio < kNisLow || !(state_.nis_ratio <= kNisHigh) ? Health::kInconsistent
-                                                                                      : Health::kConsistent;
+  estimate->health = warming_up() ? Health::kWarmingUp : state_.diverged ? Health::kDiverged : state_.nis.Judge();
 }
 
 }  // namespace metaekf::filter

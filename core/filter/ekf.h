@@ -7,15 +7,10 @@
 
 #include "absl/status/statusor.h"
 #include "core/filter/filter_model.h"
+#include "core/filter/gate.h"
+#include "core/filter/health.h"
 
 namespace metaekf::filter {
-
-enum class Health {
-  kWarmingUp,     ///< Case I before the first window is full: no estimate yet
-  kConsistent,    ///< innovations are as large as their covariance says
-  kInconsistent,  ///< the NIS, averaged, is far from what it should be
-  kDiverged,      ///< a value is not finite: do not use
-};
 
 /// What one sample taught. Physical units. Sizes: n_e estimated channels (Case II: n_x, Case I: n_y), n_y outputs.
 struct Estimate {
@@ -23,8 +18,10 @@ struct Estimate {
   Eigen::MatrixXd cov;             ///< its covariance; Case I: H P⁺ Hᵀ, without R
   Eigen::VectorXd innovation;      ///< y − h(x⁻, u); NaN where not measured
   Eigen::MatrixXd innovation_cov;  ///< S = H P⁻ Hᵀ + R; NaN where not measured
-  double nis = 0;                  ///< ỹᵀ S⁻¹ ỹ over what was measured; NaN where nothing was
+  double nis = 0;                  ///< ỹᵀ S⁻¹ ỹ over what was measured, outliers too; NaN where nothing was
   int measured = 0;                ///< components of y that were
+  int gated = 0;                   ///< of them: left out as outliers
+  bool reset = false;              ///< the covariance was widened to believe y, or the filter begun anew after it diverged
   /// Of a model whose states lie in a set: what Constrain has found and done, in units of the states' scales; else NaN.
   double slack = std::numeric_limits<double>::quiet_NaN(), projection = std::numeric_limits<double>::quiet_NaN();
   Health health = Health::kWarmingUp;
@@ -36,6 +33,8 @@ struct FilterOptions {
   std::optional<Eigen::MatrixXd> measurement_cov;  ///< R, n_y × n_y, positive definite
   std::optional<Eigen::VectorXd> initial_mean;     ///< Case II: x⁻ at the first sample; default the fleet's mean
   std::optional<Eigen::MatrixXd> initial_cov;      ///< n × n, positive semidefinite
+  GateOptions gate;
+  bool restart_after_divergence = true;  ///< begin anew, from the initial condition, with the sample after one that diverged
 };
 
 /// What a filter knows between two samples: all that a checkpoint must hold. Normalised units.
@@ -45,7 +44,9 @@ struct FilterState {
   Eigen::VectorXd last_input;      ///< u of the last sample
   std::vector<double> window;      ///< Case I: the samples of the window so far
   int64_t samples = 0;             ///< applied so far
-  double nis_ratio = 1;            ///< running mean of NIS per measured component
+  NisMonitor nis;
+  int64_t gated_in_row = 0;        ///< samples until the last that lost components
+  bool started = false;            ///< a sample has been applied since the filter was begun (anew)
   bool diverged = false;
 };
 
@@ -56,9 +57,13 @@ struct FilterState {
 ///   x⁺ = x⁻ + K ỹ            P⁺ = (I − K H) P⁻           K = P⁻ Hᵀ S⁻¹
 ///
 /// in square-root form. Where the model's states lie in a set, the estimate is put inside (Constrain), and the mean that is
-/// given out is inside to rounding in physical units. Components of y that are NaN are not measured; if all are, only time passes. In Case I the state
-/// is the latent ψ; the first H fully measured samples in a row fill the encoder's window, the last of them gives the
-/// first estimate.
+/// given out is inside to rounding in physical units. Components of y that are NaN are not measured; if all are, only time
+/// passes. In Case I the state is the latent ψ; the first H fully measured samples in a row fill the encoder's window, the
+/// last of them gives the first estimate.
+///
+/// Components of y beyond the gate are left out (Outliers). A filter that is overconfident anyway, by NisMonitor, opens its gate
+/// in the same measure, and after GateOptions::recover_after samples with outliers in a row it is widened until it believes
+/// them: no measurement is locked out for good.
 /// A filter is used by one thread at a time; Step does not allocate, unless a constraint moves the estimate.
 /// Source: paper.tex eqs. deep_cekf_all, jac_defs; the square-root form is ours.
 class Ekf {
@@ -74,9 +79,10 @@ class Ekf {
 
   /// Applies the sample (u, y) of one period after the last.
   /// @param input  n_u, finite. @param output  n_y; NaN: not measured; else finite.
-  /// Errors: InvalidArgument naming the value that is infinite, NaN or missing; the filter is unchanged then.
+  /// @param measurement_cov  R of this sample, positive definite; by default that of the filter.
+  /// Errors: InvalidArgument naming the value that is infinite, NaN or missing, or R; the filter is unchanged then.
   absl::Status Step(const Eigen::Ref<const Eigen::VectorXd>& input, const Eigen::Ref<const Eigen::VectorXd>& output,
-                    FilterModel::Scratch* scratch, Estimate* estimate);
+                    FilterModel::Scratch* scratch, Estimate* estimate, const Eigen::MatrixXd* measurement_cov = nullptr);
 
   const FilterState& state() const { return state_; }
   /// Goes on from a state of a filter of the same model and options.
@@ -84,6 +90,12 @@ class Ekf {
 
   /// u of the last sample, physical units; the inputs' means before the first.
   Eigen::VectorXd LastInput() const;
+  /// R of samples that bring none, physical units.
+  Eigen::MatrixXd MeasurementNoise() const;
+
+  /// Estimates of the samples to come, from their inputs, with nothing measured. The filter stays as it is.
+  /// @param inputs  n_u × horizon, finite. @return one estimate per column. Errors as those of Step.
+  absl::StatusOr<std::vector<Estimate>> Forecast(const Eigen::MatrixXd& inputs, FilterModel::Scratch* scratch) const;
 
   int32_t estimate_size() const { return case_one_ ? output_size_ : state_size_; }
   int32_t input_size() const { return input_size_; }
@@ -96,9 +108,16 @@ class Ekf {
 
   void FillWindow(FilterModel::Scratch* scratch);  // Case I: adds (u_, y_), encodes when full
   void TimeUpdate(FilterModel::Scratch* scratch);
-  void MeasurementUpdate(FilterModel::Scratch* scratch, Estimate* estimate);
+  void MeasurementUpdate(const Eigen::MatrixXd& R, FilterModel::Scratch* scratch, Estimate* estimate);
+  // L⁻ to L⁺ by some components of y; leaves S^½ and K S^½ in update_work_ and S^−½ ỹ in whitened_. Returns their NIS.
+  double UpdateFactor(const std::vector<Eigen::Index>& rows, const Eigen::MatrixXd& R);
+  void MoveMean();
+  void WriteInnovation(Estimate* estimate) const;
+  void LeaveOutliersOut(const Eigen::MatrixXd& R, Estimate* estimate);
+  void Restart();
   void WriteEstimate(FilterModel::Scratch* scratch, Estimate* estimate);
   void JudgeHealth(Estimate* estimate);
+  bool warming_up() const { return case_one_ && state_.window.size() < window_size_; }
 
   std::shared_ptr<const FilterModel> model_;
   std::shared_ptr<const FilterModel::Parameters> parameters_;
@@ -111,12 +130,18 @@ class Ekf {
   std::optional<physics::Polyhedron> normalised_set_;  // of the state
   Eigen::MatrixXd process_factor_;    // Q^½, normalised
   Eigen::MatrixXd measurement_cov_;   // R, normalised
+  Eigen::VectorXd initial_mean_;      // normalised
   Eigen::MatrixXd initial_factor_;
+  std::vector<double> gate_limits_;   // on the NIS of 1 … n_y components; empty: no gate
+  int64_t recover_after_ = 0;
+  bool restart_after_divergence_ = true;
 
   FilterState state_;
   // Scratch of a step, sized once.
-  Eigen::VectorXd u_, y_, value_, h_, innovation_;
-  Eigen::MatrixXd F_, H_, H_rows_, time_work_, update_work_, product_;
+  Eigen::VectorXd u_, y_, value_, h_, whitened_;
+  std::vector<Eigen::Index> measured_;  // components of y, those that are
+  Eigen::Index updated_ = 0;            // components in the last UpdateFactor
+  Eigen::MatrixXd F_, H_, H_rows_, time_work_, update_work_, product_, prior_factor_;
 };
 
 }  // namespace metaekf::filter

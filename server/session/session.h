@@ -5,7 +5,7 @@
 #include <string>
 
 #include "absl/status/statusor.h"
-#include "core/filter/ekf.h"
+#include "core/filter/replay.h"
 #include "metaekf/v1/estimation.pb.h"
 #include "server/serving/model_cache.h"
 
@@ -18,37 +18,41 @@ class Session {
   static absl::StatusOr<std::unique_ptr<Session>> Open(std::shared_ptr<const ServedModel> model,
                                                        const v1::OpenSession& open);
 
-  /// Applies a batch and writes what it taught. Samples with numbers already applied are skipped.
+  /// Applies a batch and writes what it taught. Samples with numbers already applied are skipped; one that is not later than the
+  /// newest goes to its own time.
   /// Errors: InvalidArgument with violations below `samples`; OutOfRange (SEQUENCE_GAP) if numbers are missing. The
   /// session is unchanged then.
   absl::Status Apply(const v1::SampleBatch& batch, filter::FilterModel::Scratch* scratch, v1::EstimateBatch* estimates);
 
   /// Everything that changes, as bytes with a checksum; and back.
   std::string Checkpoint() const;
-  /// Errors: DataLoss if the bytes are damaged.
-  absl::Status Restore(const std::string& checkpoint);
+  /// Errors: those of DecodeCheckpoint.
+  absl::Status Restore(const std::string& checkpoint, filter::FilterModel::Scratch* scratch);
 
   uint64_t applied_seq() const { return seq_; }
   const ServedModel& model() const { return *model_; }
   void Describe(v1::SessionOpened* opened) const;
 
  private:
-  Session(std::shared_ptr<const ServedModel> model, filter::Ekf ekf, const v1::OpenSession& open);
+  Session(std::shared_ptr<const ServedModel> model, filter::ReplayFilter filter, const v1::OpenSession& open);
 
   absl::Status Check(const v1::SampleBatch& batch, int64_t rows) const;
-  /// Periods from the last sample to one at `time_s`: 1 if none is missing between them.
-  absl::StatusOr<int64_t> PeriodsTo(double time_s, double last_time_s) const;
-  absl::Status Step(const double* input, const double* output, filter::FilterModel::Scratch* scratch);
-  void Append(const double* output, v1::EstimateBatch* estimates) const;
+  absl::Status CheckTimes(const v1::SampleBatch& batch) const;
+  /// Periods from the last sample to one at `time_s`: 1 if none is missing between them, 0 or less for a late measurement of one
+  /// of the `remembered` samples, the last included.
+  absl::StatusOr<int64_t> PeriodsTo(double time_s, double last_time_s, int64_t remembered) const;
+  absl::Status ApplyRow(const v1::SampleBatch& batch, int64_t row, filter::FilterModel::Scratch* scratch,
+                        v1::EstimateBatch* estimates);
+  void Append(double time_s, const double* output, bool delayed, v1::EstimateBatch* estimates) const;
 
   const std::shared_ptr<const ServedModel> model_;
-  filter::Ekf ekf_;
+  filter::ReplayFilter filter_;
   filter::Estimate estimate_;
   const v1::OpenSession::CovarianceFormat covariance_format_;
   const bool send_innovations_;
   const double period_s_;
   uint64_t seq_ = 0;    // the last sample applied
-  double time_s_ = 0;   // its time
+  double time_s_ = 0;   // of the newest
 };
 
 }  // namespace metaekf::server

@@ -87,8 +87,13 @@ absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Attach(const store:
   live->token = token;
   live->durable_seq = static_cast<uint64_t>(stored.durable_seq);
   METAEKF_ASSIGN_OR_RETURN(live->session, Session::Open(model, settings));
-  if (!stored.checkpoint.empty()) METAEKF_RETURN_IF_ERROR(live->session->Restore(stored.checkpoint));
   live->scratch = PoolOf(model->filter_model);
+  if (!stored.checkpoint.empty()) {
+    std::unique_ptr<filter::FilterModel::Scratch> scratch = live->scratch->Take();
+    const absl::Status restored = live->session->Restore(stored.checkpoint, scratch.get());
+    live->scratch->GiveBack(std::move(scratch));
+    METAEKF_RETURN_IF_ERROR(restored);
+  }
   std::shared_ptr<LiveSession> before;
   {
     std::lock_guard lock(mutex_);

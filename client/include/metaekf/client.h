@@ -247,6 +247,13 @@ struct NoiseSettings {
   std::vector<double> process_noise_cov, measurement_noise_cov, initial_mean, initial_cov;
 };
 
+/// When a measurement is taken for an outlier and left out.
+struct GateSettings {
+  double probability = 0;  ///< with which a right measurement passes; 0: the server's default
+  int32_t recover_after = 0;  ///< samples with outliers in a row until they are believed; 0: its default
+  bool off = false;           ///< every measurement is believed
+};
+
 enum class CovarianceFormat { kNone, kDiagonal, kLowerTriangle };
 
 struct EstimationOptions {
@@ -256,6 +263,8 @@ struct EstimationOptions {
   bool send_innovations = false;
   double sample_period_s = 0;   ///< 0: the model's
   double max_lag_s = 0;         ///< how far behind the latest sample a measurement may be
+  GateSettings gate;
+  bool stay_diverged = false;   ///< do not begin anew after a divergence
   size_t max_in_flight = 8192;  ///< samples that may wait for their answer
   size_t max_kept = 65536;      ///< answered samples kept for Resume
 };
@@ -281,17 +290,19 @@ struct SampleBatch {
   size_t samples = 0;
   std::vector<double> inputs, outputs;
   std::vector<double> times_s;  ///< one each, or none: each one period after the one before
+  /// R of each sample instead of the session's: rows × n_y (diagonals) or × n_y(n_y+1)/2; or none.
+  std::vector<double> measurement_noise_covs;
 };
 
-enum class Health { kUnknown, kWarmingUp, kConsistent, kInconsistent, kDiverged };
+enum class Health { kUnknown, kWarmingUp, kConsistent, kOverconfident, kDiverged, kUnderconfident };
 
 /// Bits of EstimateBatch::flags.
 enum Flag : uint32_t {
   kMissing = 1,    ///< some or all of y was not measured
-  kGated = 2,      ///< y was left out as an outlier
+  kGated = 2,      ///< some or all of y was left out as an outlier
   kProjected = 4,  ///< the estimate was moved into its constraints
   kDelayed = 8,    ///< y was applied at an earlier time than the latest
-  kReset = 16,     ///< the covariance was started anew
+  kReset = 16,     ///< widened to believe y after outliers in a row, or begun anew after divergence
   kAdapted = 32,   ///< the model adapted to the stream
 };
 

@@ -45,7 +45,7 @@ TEST(EstimateRowsTest, ConstrainedRowsEndWithSlackAndProjection) {
 TEST(EstimateRowsTest, WordsAreThoseOfTheContract) {
   EXPECT_EQ(FlagWords(63), "missing|gated|projected|delayed|reset|adapted");
   EXPECT_EQ(FlagWords(0), "");
-  EXPECT_STREQ(HealthWord(client::Health::kInconsistent), "inconsistent");
+  EXPECT_STREQ(HealthWord(client::Health::kOverconfident), "overconfident");
   EXPECT_STREQ(HealthWord(client::Health::kDiverged), "diverged");
 }
 

@@ -4,6 +4,7 @@
 
 #include <Eigen/LU>
 
+#include "tests/core/filter/linear_filter.h"
 #include "tests/core/nssm/random_models.h"
 #include "tests/support/bundles.h"
 #include "tests/support/count_allocations.h"
@@ -15,12 +16,6 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
-
-VectorXd RandomVector(base::Rng* rng, Eigen::Index n) {
-  VectorXd v(n);
-  for (double& value : v) value = rng->Normal();
-  return v;
-}
 
 TEST(FilterModelTest, JacobiansMatchCentralDifferencesForEveryKindOfModel) {
   for (const nssm::ModelCase& c : nssm::ModelCases()) {
@@ -56,48 +51,11 @@ TEST(FilterModelTest, JacobiansMatchCentralDifferencesForEveryKindOfModel) {
   }
 }
 
-/// A linear Case II model x⁺ = A x + B u, y = C x in the parameters of a network without hidden layers.
-struct LinearSystem {
-  MatrixXd A{{0.9, 0.2}, {-0.1, 0.95}}, B{{0.1}, {0.5}}, C{{1, 0}, {0.3, 1}};
-  MatrixXd Q{{0.02, 0.005}, {0.005, 0.01}}, R{{0.3, 0.1}, {0.1, 0.2}}, P0{{2, 0.3}, {0.3, 1}};
-};
-
-nssm::Bundle LinearBundle(const LinearSystem& system) {
-  nssm::ModelSpec spec{.kind = nssm::Case::kStateInputOutput, .input_size = 1, .output_size = 2, .state_size = 2, .latent_size = 3, .window = 1};
-  spec.precision = nssm::Precision::kFloat64;
-  nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(spec));
-  bundle.noise = {system.Q, system.R, system.P0};
-  // ψ = [x; u]; 𝓐 advances it and drops u; 𝓓x and 𝓓y read x.
-  support::SetWeight("encoder.0.weight", MatrixXd::Identity(3, 3), &bundle);
-  MatrixXd transition = MatrixXd::Zero(3, 4);
-  transition.topLeftCorner(2, 2) = system.A;
-  transition.block(0, 2, 2, 1) = 0.5 * system.B;  // u enters twice: through ψ and beside it
-  transition.block(0, 3, 2, 1) = 0.5 * system.B;
-  support::SetWeight("transition.0.weight", transition, &bundle);
-  support::SetWeight("state_decoder.0.weight", MatrixXd::Identity(2, 3), &bundle);
-  MatrixXd output = MatrixXd::Zero(2, 3);
-  output.leftCols(2) = system.C;
-  support::SetWeight("output_decoder.0.weight", output, &bundle);
-  return bundle;
-}
-
-struct Filter {
-  explicit Filter(const nssm::Bundle& bundle, const FilterOptions& options = {})
-      : model(FilterModel::Create(bundle)),
-        scratch(model->MakeScratch()),
-        ekf(*Ekf::Create(bundle, model, model->Prepare(bundle.parameters), options)),
-        estimate(ekf.MakeEstimate()) {}
-  std::shared_ptr<FilterModel> model;
-  std::unique_ptr<FilterModel::Scratch> scratch;
-  Ekf ekf;
-  Estimate estimate;
-};
-
 // Oracle: the exact Kalman filter with textbook formulas, with missing components and wholly missing samples.
 TEST(EkfTest, EqualsTheKalmanFilterOnALinearSystem) {
   const LinearSystem s;
   nssm::Bundle bundle = LinearBundle(s);
-  Filter filter(bundle, {.initial_mean = VectorXd{{0.5, -0.2}}});
+  Filter filter(bundle, {.initial_mean = VectorXd{{0.5, -0.2}}, .gate = {.probability = 0}});
   base::Rng rng(4);
   VectorXd x{{0.5, -0.2}};
   MatrixXd P = s.P0;
@@ -214,6 +172,174 @@ TEST(EkfTest, ARestoredFilterGoesOnBitForBit) {
   }
 }
 
+// A true system and the filter that knows it: nothing is gated beyond the false alarms that were asked for, bounds hold what they
+// say, and NEES and NIS are χ².
+TEST(EkfTest, IsConsistentWithTheSystemThatItKnows) {
+  const nssm::Bundle bundle = LinearBundle(LinearSystem());
+  double nees = 0, nis = 0;
+  int64_t samples = 0, gated = 0, unhealthy = 0;
+  constexpr int kRuns = 50, kSteps = 400;
+  for (uint64_t run = 0; run < kRuns; ++run) {
+    Filter filter(bundle);
+    LinearTruth truth(LinearSystem(), run);
+    for (int t = 0; t < kSteps; ++t) {
+      const VectorXd u = RandomVector(&truth.rng, 1);
+      ASSERT_TRUE(filter.ekf.Step(u, truth.Measure(), filter.scratch.get(), &filter.estimate).ok());
+      const VectorXd error = filter.estimate.mean - truth.state;
+      nees += error.dot(filter.estimate.cov.inverse() * error);
+      nis += filter.estimate.nis;
+      gated += filter.estimate.gated;
+      unhealthy += filter.estimate.health == Health::kConsistent ? 0 : 1;
+      ++samples;
+      truth.Advance(u[0]);
+    }
+  }
+  // 20,000 samples: the NIS, white, has standard deviation √(2·2/20000) = 0.014 about 2. Errors are correlated over some 20 samples.
+  EXPECT_NEAR(nis / static_cast<double>(samples), 2, 0.06);
+  EXPECT_NEAR(nees / static_cast<double>(samples), 2, 0.25);
+  EXPECT_LE(gated, 1);
+  EXPECT_LT(unhealthy, samples / 200);
+}
+
+TEST(EkfTest, OutliersAreLeftOutComponentByComponent) {
+  const nssm::Bundle bundle = LinearBundle(LinearSystem());
+  Filter filter(bundle), without(bundle);
+  LinearTruth truth(LinearSystem(), 5);
+  for (int t = 0; t < 200; ++t) {
+    const VectorXd u = RandomVector(&truth.rng, 1);
+    VectorXd y = truth.Measure(), spared = y;
+    if (t % 20 == 10) {
+      y[1] += 1e4;
+      spared[1] = kNaN;
+    }
+    ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
+    ASSERT_TRUE(without.ekf.Step(u, spared, without.scratch.get(), &without.estimate).ok());
+    EXPECT_EQ(filter.estimate.gated, t % 20 == 10 ? 1 : 0);
+    if (t % 20 == 10) {
+      EXPECT_GT(filter.estimate.nis, 1e4);
+      EXPECT_GT(filter.estimate.innovation[1], 9e3);
+    }
+    // As if the wrong component had not been measured.
+    EXPECT_LT((filter.estimate.mean - without.estimate.mean).norm(), 1e-12);
+    EXPECT_LT((filter.estimate.cov - without.estimate.cov).norm(), 1e-12);
+    EXPECT_EQ(filter.estimate.health, Health::kConsistent);
+    truth.Advance(u[0]);
+  }
+}
+
+TEST(EkfTest, AJumpIsBelievedAfterFiveSamples) {
+  const nssm::Bundle bundle = LinearBundle(LinearSystem());
+  Filter filter(bundle);
+  LinearTruth truth(LinearSystem(), 6);
+  std::vector<int> gated_at, reset_at;
+  for (int t = 0; t < 140; ++t) {
+    if (t == 100) truth.state[0] += 1000;  // someone has carried the system elsewhere
+    const VectorXd u = RandomVector(&truth.rng, 1);
+    ASSERT_TRUE(filter.ekf.Step(u, truth.Measure(), filter.scratch.get(), &filter.estimate).ok());
+    if (filter.estimate.gated > 0) gated_at.push_back(t);
+    if (filter.estimate.reset) {
+      reset_at.push_back(t);
+      EXPECT_LT((filter.estimate.mean - truth.state).norm(), 5);
+      EXPECT_EQ(filter.estimate.health, Health::kOverconfident);
+    }
+    truth.Advance(u[0]);
+  }
+  EXPECT_EQ(gated_at, (std::vector<int>{100, 101, 102, 103, 104}));
+  EXPECT_EQ(reset_at, std::vector<int>{105});
+}
+
+TEST(EkfTest, AnOverconfidentFilterDoesNotLockMeasurementsOut) {
+  nssm::Bundle bundle = LinearBundle(LinearSystem());
+  bundle.noise.process *= 1e-4;
+  bundle.noise.measurement *= 1e-4;  // a hundredth of the true deviations
+  Filter filter(bundle);
+  LinearTruth truth(LinearSystem(), 7);
+  int gated = 0;
+  double squares = 0;
+  for (int t = 0; t < 600; ++t) {
+    const VectorXd u = RandomVector(&truth.rng, 1);
+    ASSERT_TRUE(filter.ekf.Step(u, truth.Measure(), filter.scratch.get(), &filter.estimate).ok());
+    if (t >= 100) {
+      gated += filter.estimate.gated;
+      squares += (filter.estimate.mean - truth.state).squaredNorm();
+      EXPECT_EQ(filter.estimate.health, Health::kOverconfident);
+    }
+    truth.Advance(u[0]);
+  }
+  EXPECT_LE(gated, 10);
+  EXPECT_LT(std::sqrt(squares / 500), 1);
+}
+
+TEST(EkfTest, BeginsAnewAfterADivergenceUnlessToldNotTo) {
+  for (const bool restart : {true, false}) {
+    nssm::Bundle bundle = LinearBundle(LinearSystem());
+    Filter filter(bundle, {.gate = {.probability = 0}, .restart_after_divergence = restart});
+    const VectorXd u{{0.1}}, y{{0.2, 0.1}};
+    ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
+    const VectorXd first = filter.estimate.mean;
+    ASSERT_TRUE(filter.ekf.Step(VectorXd{{1e308}}, y, filter.scratch.get(), &filter.estimate).ok());
+    ASSERT_TRUE(filter.ekf.Step(VectorXd{{1e308}}, VectorXd{{1e308, -1e308}}, filter.scratch.get(), &filter.estimate).ok());
+    for (int t = 0; t < 5 && filter.estimate.health != Health::kDiverged; ++t) {
+      ASSERT_TRUE(filter.ekf.Step(VectorXd{{1e308}}, VectorXd{{1e308, -1e308}}, filter.scratch.get(), &filter.estimate).ok());
+    }
+    ASSERT_EQ(filter.estimate.health, Health::kDiverged);
+    ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
+    EXPECT_EQ(filter.estimate.reset, restart);
+    EXPECT_EQ(filter.estimate.health, restart ? Health::kConsistent : Health::kDiverged);
+    if (restart) {
+      EXPECT_EQ(filter.estimate.mean, first);
+    }
+  }
+}
+
+TEST(EkfTest, ASampleMayBringItsOwnNoise) {
+  const LinearSystem system;
+  const nssm::Bundle bundle = LinearBundle(system);
+  LinearSystem noisier = system;
+  noisier.R *= 9;
+  const nssm::Bundle noisy = LinearBundle(noisier);
+  Filter filter(bundle), expected(noisy);
+  const MatrixXd R = 9 * system.R;
+  base::Rng rng(3);
+  for (int t = 0; t < 20; ++t) {
+    const VectorXd u = RandomVector(&rng, 1), y = RandomVector(&rng, 2);
+    ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate, &R).ok());
+    ASSERT_TRUE(expected.ekf.Step(u, y, expected.scratch.get(), &expected.estimate).ok());
+    EXPECT_LT((filter.estimate.mean - expected.estimate.mean).norm(), 1e-12);
+    EXPECT_LT((filter.estimate.cov - expected.estimate.cov).norm(), 1e-12);
+  }
+  const FilterState before = filter.ekf.state();
+  const MatrixXd wrong = -R;
+  EXPECT_EQ(filter.ekf.Step(VectorXd{{0.0}}, VectorXd{{0.0, 0.0}}, filter.scratch.get(), &filter.estimate, &wrong).code(),
+            absl::StatusCode::kInvalidArgument);
+  EXPECT_EQ(filter.ekf.state().mean, before.mean);
+}
+
+TEST(EkfTest, ForecastsAreWhatPassesWithoutMeasurements) {
+  const LinearSystem system;
+  const nssm::Bundle bundle = LinearBundle(system);
+  Filter filter(bundle);
+  base::Rng rng(3);
+  for (int t = 0; t < 20; ++t) {
+    ASSERT_TRUE(filter.ekf.Step(RandomVector(&rng, 1), RandomVector(&rng, 2), filter.scratch.get(), &filter.estimate).ok());
+  }
+  const MatrixXd inputs = MatrixXd{{0.3, -1, 2}};
+  VectorXd x = filter.estimate.mean;
+  MatrixXd P = filter.estimate.cov;
+  double u = filter.ekf.LastInput()[0];
+  const auto forecast = filter.ekf.Forecast(inputs, filter.scratch.get());
+  ASSERT_TRUE(forecast.ok());
+  ASSERT_EQ(forecast->size(), 3U);
+  for (size_t t = 0; t < 3; ++t) {
+    x = system.A * x + system.B * u;
+    P = system.A * P * system.A.transpose() + system.Q;
+    u = inputs(0, static_cast<Eigen::Index>(t));
+    EXPECT_LT(((*forecast)[t].mean - x).norm(), 1e-12);
+    EXPECT_LT(((*forecast)[t].cov - P).norm(), 1e-12);
+  }
+  EXPECT_FALSE(filter.ekf.Forecast(MatrixXd{{kNaN}}, filter.scratch.get()).ok());
+}
+
 TEST(EkfTest, WrongNoiseIsRefusedByName) {
   const nssm::Bundle bundle = LinearBundle(LinearSystem());
   const std::shared_ptr<FilterModel> model = FilterModel::Create(bundle);
@@ -225,12 +351,14 @@ TEST(EkfTest, WrongNoiseIsRefusedByName) {
   EXPECT_NE(message({.measurement_cov = MatrixXd::Zero(2, 2)}).find("positive definite"), std::string::npos);
   EXPECT_NE(message({.initial_cov = -MatrixXd::Identity(2, 2)}).find("initial covariance"), std::string::npos);
   EXPECT_NE(message({.initial_mean = VectorXd::Zero(3)}).find("initial mean"), std::string::npos);
+  EXPECT_NE(message({.gate = {.probability = 1}}).find("gate"), std::string::npos);
+  EXPECT_NE(message({.gate = {.recover_after = 0}}).find("gate"), std::string::npos);
 }
 
 // Weights and measurements of any size, in float and double: whatever the filter makes of them, what it says is inside.
 TEST(EkfTest, EstimatesOfConstrainedStatesAreInsideWhateverTheWeights) {
   int64_t estimates = 0, projected = 0;
-  for (uint64_t seed = 0; seed < 60; ++seed) {
+  for (uint64_t seed = 0; seed < 2600; ++seed) {
     base::Rng rng(seed);
     for (nssm::ModelCase c : nssm::ModelCases()) {
       if (c.name != "Case II, ordered states") continue;
@@ -246,15 +374,15 @@ TEST(EkfTest, EstimatesOfConstrainedStatesAreInsideWhateverTheWeights) {
       for (int t = 0; t < 400; ++t) {
         const VectorXd u = RandomVector(&rng, 1), y = std::pow(10.0, rng.Uniform(-2, 3)) * RandomVector(&rng, 2);
         ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
-        if (filter.estimate.health == Health::kDiverged) break;
+        if (filter.estimate.health == Health::kDiverged) continue;  // it begins anew
         ASSERT_TRUE(physics::Contains(*bundle.model.state_set(), filter.estimate.mean)) << "seed " << seed << ", step " << t;
         ++estimates;
         projected += filter.estimate.projection > 0 ? 1 : 0;
       }
     }
   }
-  EXPECT_GT(estimates, 10000);
-  EXPECT_GT(projected, 500);
+  EXPECT_GT(estimates, 1000000);
+  EXPECT_GT(projected, 50000);
 }
 
 #if METAEKF_COUNTS_ALLOCATIONS

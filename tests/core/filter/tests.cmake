@@ -1,3 +1,6 @@
+metaekf_test(core/filter/chi_squared_test.cc DEPS metaekf::core_filter)
 metaekf_test(core/filter/constrain_test.cc DEPS metaekf::core_filter)
 metaekf_test(core/filter/ekf_test.cc DEPS metaekf::core_filter)
+metaekf_test(core/filter/gate_test.cc DEPS metaekf::core_filter)
+metaekf_test(core/filter/replay_test.cc DEPS metaekf::core_filter)
 metaekf_test(core/filter/square_root_test.cc DEPS metaekf::core_filter)

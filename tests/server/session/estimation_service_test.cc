@@ -293,6 +293,110 @@ TEST_F(EstimationServiceTest, AGapInTimeIsATimeUpdateForEachPeriod) {
   ExpectIdentical(estimates, expected);
 }
 
+// Every third measurement comes two samples later: what is known after it is what a stream without delays knows at that time.
+TEST_F(EstimationServiceTest, LateMeasurementsGoToTheirOwnTimeAndSurviveAResume) {
+  const Recording recording = MakeRecording(60, 0);
+  const Estimates direct = Direct(recording);
+  const size_t row = direct.size() / 60;
+  const double period = bundle_->sample_period_s;
+  v1::EstimateRequest open = OpenRequest();
+  open.mutable_open()->set_max_lag_s(3 * period);
+  Call call = Start(open);
+  v1::SessionOpened opened = ReadOpened(call);
+  uint64_t seq = 0;
+  const auto send = [&](double periods, double input, double output) {
+    v1::EstimateRequest request;
+    v1::SampleBatch* batch = request.mutable_samples();
+    batch->set_first_seq(++seq);
+    batch->add_times_s(periods * period);
+    batch->add_inputs(input);
+    batch->add_outputs(output);
+    call.stream->Write(request);
+    v1::EstimateResponse response;
+    EXPECT_TRUE(call.stream->Read(&response)) << call.stream->Finish().error_message();
+    return response.estimates();
+  };
+  for (size_t t = 0; t < 60; ++t) {
+    const bool late = t % 3 == 0 && t + 2 < 60;
+    send(static_cast<double>(t), recording.inputs[t], late ? kNaN : recording.outputs[t]);
+    if (t % 3 == 2) {
+      const v1::EstimateBatch at = send(static_cast<double>(t - 2), 0, recording.outputs[t - 2]);
+      EXPECT_EQ(at.flags(0), v1::EstimateBatch::DELAYED);
+      EXPECT_EQ(at.times_s(0), static_cast<double>(t - 2) * period);
+      Estimates estimates;
+      Append(at, &estimates);
+      ExpectIdentical(estimates, {direct.begin() + static_cast<long>((t - 2) * row), direct.begin() + static_cast<long>((t - 1) * row)});
+    }
+    if (t == 31) {  // a late measurement of sample 30 is still to come
+      EXPECT_TRUE(End(call).ok());
+      call = Start(ResumeRequest(opened));
+      const std::string token = opened.token();
+      opened = ReadOpened(call);
+      opened.set_token(token);
+      ASSERT_EQ(opened.durable_seq(), seq);
+    }
+  }
+  Estimates last;
+  Append(send(60, 0.5, kNaN), &last);
+  EXPECT_FALSE(std::isnan(last[0]));
+  // Later than the lag.
+  v1::EstimateRequest request = Batch(recording, ++seq, 1);
+  request.mutable_samples()->set_first_seq(seq);
+  request.mutable_samples()->clear_inputs();
+  request.mutable_samples()->clear_outputs();
+  request.mutable_samples()->add_inputs(0);
+  request.mutable_samples()->add_outputs(1);
+  request.mutable_samples()->add_times_s(56 * period);
+  call.stream->Write(request);
+  v1::EstimateResponse response;
+  EXPECT_FALSE(call.stream->Read(&response));
+  const grpc::Status status = call.stream->Finish();
+  EXPECT_EQ(status.error_code(), grpc::StatusCode::INVALID_ARGUMENT);
+  EXPECT_NE(status.error_message().find("at most 3 sample periods late"), std::string::npos) << status.error_message();
+}
+
+TEST_F(EstimationServiceTest, OutliersAreFlaggedAndBelievedWithoutAGate) {
+  Recording recording = MakeRecording(50, 0);
+  recording.outputs[40] += 1e6;
+  for (const bool off : {false, true}) {
+    v1::EstimateRequest open = OpenRequest();
+    open.mutable_open()->mutable_gate()->set_off(off);
+    Call call = Start(open);
+    ReadOpened(call);
+    call.stream->Write(Batch(recording, 1, 50));
+    v1::EstimateResponse response;
+    ASSERT_TRUE(call.stream->Read(&response));
+    EXPECT_EQ(response.estimates().flags(40), off ? v1::EstimateBatch::NO_FLAG : v1::EstimateBatch::GATED);
+    EXPECT_GT(response.estimates().nis(40), 1e6);
+  }
+}
+
+TEST_F(EstimationServiceTest, SamplesMayBringTheirOwnNoise) {
+  const Recording recording = MakeRecording(20, 0);
+  v1::EstimateRequest noisy = OpenRequest();
+  noisy.mutable_open()->mutable_noise()->add_measurement_noise_cov(0.7);
+  Call expected = Start(noisy), call = Start(OpenRequest());
+  ReadOpened(expected);
+  ReadOpened(call);
+  v1::EstimateRequest request = Batch(recording, 1, 20);
+  for (int t = 0; t < 20; ++t) request.mutable_samples()->add_measurement_noise_covs(0.7);
+  call.stream->Write(request);
+  v1::EstimateResponse response;
+  ASSERT_TRUE(call.stream->Read(&response));
+  Estimates estimates;
+  Append(response.estimates(), &estimates);
+  ExpectIdentical(estimates, Run(expected, recording, 1, 20, 20));
+
+  request = Batch(recording, 21, 20);
+  request.mutable_samples()->set_first_seq(21);
+  request.mutable_samples()->add_inputs(0);
+  request.mutable_samples()->add_outputs(0);
+  request.mutable_samples()->add_measurement_noise_covs(-1);
+  call.stream->Write(request);
+  EXPECT_FALSE(call.stream->Read(&response));
+  EXPECT_NE(call.stream->Finish().error_message().find("samples.measurement_noise_covs"), std::string::npos);
+}
+
 TEST_F(EstimationServiceTest, WhatCannotBeOpenedIsRefused) {
   const auto status_of = [&](const v1::EstimateRequest& first) {
     Call call = Start(first);
@@ -306,8 +410,17 @@ TEST_F(EstimationServiceTest, WhatCannotBeOpenedIsRefused) {
   request.mutable_open()->mutable_noise()->add_process_noise_cov(-1);
   EXPECT_NE(status_of(request).error_message().find("open.noise.process_noise_cov"), std::string::npos);
   request = OpenRequest();
-  request.mutable_open()->set_max_lag_s(1);
-  EXPECT_NE(status_of(request).error_message().find("open.max_lag_s"), std::string::npos);
+  for (const double lag : {-1.0, 1e9, kNaN}) {
+    request = OpenRequest();
+    request.mutable_open()->set_max_lag_s(lag);
+    EXPECT_NE(status_of(request).error_message().find("open.max_lag_s"), std::string::npos) << lag;
+  }
+  request = OpenRequest();
+  request.mutable_open()->mutable_gate()->set_probability(1);
+  EXPECT_NE(status_of(request).error_message().find("open.gate.probability"), std::string::npos);
+  request = OpenRequest();
+  request.mutable_open()->mutable_gate()->set_recover_after(-1);
+  EXPECT_NE(status_of(request).error_message().find("open.gate.recover_after"), std::string::npos);
   request = OpenRequest();
   request.mutable_open()->set_sample_period_s(7);
   EXPECT_NE(status_of(request).error_message().find("open.sample_period_s"), std::string::npos);

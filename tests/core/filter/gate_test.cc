@@ -1,0 +1,67 @@
+#include "core/filter/gate.h"
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include <Eigen/Cholesky>
+
+#include "core/base/rng.h"
+#include "core/filter/health.h"
+
+namespace metaekf::filter {
+namespace {
+
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+const std::vector<double> kLimits = {24, 28, 31};  // χ² at about one in a million
+
+TEST(GateTest, TheComponentThatIsWrongIsLeftOut) {
+  const MatrixXd S = MatrixXd{{4, 1, 0}, {1, 1, 0}, {0, 0, 9}};
+  EXPECT_THAT(Outliers(VectorXd{{2, 1, 3}}, S, kLimits), testing::ElementsAre());
+  EXPECT_THAT(Outliers(VectorXd{{2, 50, 3}}, S, kLimits), testing::ElementsAre(1));
+  EXPECT_THAT(Outliers(VectorXd{{100, 1, -900}}, S, kLimits), testing::ElementsAre(0, 2));
+  EXPECT_THAT(Outliers(VectorXd{{1e3, 1e3, 1e4}}, S, kLimits), testing::ElementsAre(0, 1, 2));
+  EXPECT_THAT(Outliers(VectorXd{{std::nan(""), 1, 1}}, S, kLimits), testing::Contains(0));
+}
+
+TEST(GateTest, WideningMakesTheInnovationWhatIsExpected) {
+  const MatrixXd A{{0.5, 0.2}, {0.2, 0.3}}, R{{0.1, 0}, {0, 0.2}};
+  const VectorXd innovation{{8, -5}};
+  const double widening = WideningFor(innovation, A, R);
+  EXPECT_GT(widening, 1);
+  EXPECT_NEAR(innovation.dot((widening * A + R).llt().solve(innovation)), 2, 1e-4);
+  EXPECT_EQ(WideningFor(VectorXd{{0.1, 0.1}}, A, R), 1);
+  // Nothing that the filter could be wrong about explains this component.
+  EXPECT_NEAR(WideningFor(VectorXd{{0, 5}}, MatrixXd{{1, 0}, {0, 0}}, R), 1e12, 1e8);
+}
+
+TEST(NisMonitorTest, SaysWhichWayTheCovarianceIsWrong) {
+  base::Rng rng(3);
+  const auto judge = [&](double variance, int samples) {
+    NisMonitor monitor;
+    for (int t = 0; t < samples; ++t) monitor.Add(variance * (std::pow(rng.Normal(), 2) + std::pow(rng.Normal(), 2)), 2);
+    return monitor.Judge();
+  };
+  int early_alarms = 0;
+  for (int run = 0; run < 50; ++run) {
+    EXPECT_EQ(judge(1, 1000), Health::kConsistent);
+    EXPECT_EQ(judge(2, 1000), Health::kOverconfident);
+    EXPECT_EQ(judge(0.5, 1000), Health::kUnderconfident);
+    early_alarms += judge(1, 3) == Health::kConsistent ? 0 : 1;
+  }
+  EXPECT_LE(early_alarms, 1) << "at 99.9 % on both sides, 50 trials";
+  EXPECT_EQ(NisMonitor().Judge(), Health::kConsistent);
+}
+
+TEST(NisMonitorTest, ForgetsWhatIsLongAgo) {
+  NisMonitor monitor;
+  for (int t = 0; t < 100; ++t) monitor.Add(9, 1);
+  EXPECT_EQ(monitor.Judge(), Health::kOverconfident);
+  for (int t = 0; t < 600; ++t) monitor.Add(1, 1);
+  EXPECT_EQ(monitor.Judge(), Health::kConsistent);
+  EXPECT_NEAR(monitor.Ratio(), 1, 0.03);
+}
+
+}  // namespace
+}  // namespace metaekf::filter
