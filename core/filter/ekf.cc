@@ -166,6 +166,7 @@ absl::Status Ekf::Step(const Ref<const VectorXd>& input, const Ref<const VectorX
   if (estimate->reset) Restart();
   u_ = (input - normaliser_.inputs.mean).cwiseQuotient(normaliser_.inputs.scale);
   y_ = (output - normaliser_.outputs.mean).cwiseQuotient(normaliser_.outputs.scale);
+  if (trace_ != nullptr) *trace_ = {};
   if (warming_up()) {
     FillWindow(scratch);
     // The window's last sample is the first with a latent; its measurement has been used by the encoder.
@@ -183,7 +184,16 @@ absl::Status Ekf::Step(const Ref<const VectorXd>& input, const Ref<const VectorX
     estimate->slack = effect.slack;
     estimate->projection = effect.projection;
   }
-  WriteEstimate(scratch, estimate);
+  if (warming_up()) {
+    estimate->mean.setConstant(kNaN);
+    estimate->cov.setConstant(kNaN);
+  } else {
+    Describe(state_.mean, state_.factor, u_, scratch, estimate);
+  }
+  if (trace_ != nullptr) {
+    trace_->input = u_;
+    trace_->warming_up = warming_up();
+  }
   JudgeHealth(estimate);
   return absl::OkStatus();
 }
@@ -232,6 +242,10 @@ void Ekf::TimeUpdate(FilterModel::Scratch* scratch) {
   model_->Transition(*parameters_, state_.mean, next_input_ ? u_ : state_.last_input, &value_, &F_, scratch);
   FactorTimeUpdate(F_, process_factor_, &time_work_, &state_.factor);
   state_.mean = value_;
+  if (trace_ == nullptr) return;
+  trace_->linked = true;
+  trace_->prior = value_;
+  trace_->F = F_;
 }
 
 void Ekf::MeasurementUpdate(const MatrixXd& R, FilterModel::Scratch* scratch, Estimate* estimate) {
@@ -309,7 +323,9 @@ void Ekf::LeaveOutliersOut(const MatrixXd& R, Estimate* estimate) {
     state_.gated_in_row = 0;
     estimate->reset = true;
     state_.nis.Add(estimate->nis, estimate->measured);
-    state_.factor *= std::sqrt(WideningFor(innovation, predicted_cov, R_measured));
+    const double widening = WideningFor(innovation, predicted_cov, R_measured);
+    if (trace_ != nullptr) trace_->widening = widening;
+    state_.factor *= std::sqrt(widening);
     UpdateFactor(measured_, R);
     return MoveMean();
   }
@@ -327,21 +343,17 @@ void Ekf::LeaveOutliersOut(const MatrixXd& R, Estimate* estimate) {
   MoveMean();
 }
 
-void Ekf::WriteEstimate(FilterModel::Scratch* scratch, Estimate* estimate) {
-  if (warming_up()) {
-    estimate->mean.setConstant(kNaN);
-    estimate->cov.setConstant(kNaN);
-    return;
-  }
+void Ekf::Describe(const VectorXd& mean, const MatrixXd& factor, const VectorXd& input, FilterModel::Scratch* scratch,
+                   Estimate* estimate) {
   const data::ChannelScaling& scaling = case_one_ ? normaliser_.outputs : normaliser_.states;
   auto root = product_.topRows(estimate_size());
   if (case_one_) {
-    model_->Measurement(*parameters_, state_.mean, u_, &h_, &H_, scratch);
+    model_->Measurement(*parameters_, mean, input, &h_, &H_, scratch);
     estimate->mean = h_.cwiseProduct(scaling.scale) + scaling.mean;
-    root.noalias() = H_.lazyProduct(state_.factor);
+    root.noalias() = H_.lazyProduct(factor);
   } else {
-    estimate->mean = state_.mean.cwiseProduct(scaling.scale) + scaling.mean;
-    root = state_.factor;
+    estimate->mean = mean.cwiseProduct(scaling.scale) + scaling.mean;
+    root = factor;
   }
   if (set_ && estimate->mean.allFinite() && !physics::Contains(*set_, estimate->mean)) {
     estimate->mean = physics::Inside(*set_, estimate->mean);  // rounding has put it outside

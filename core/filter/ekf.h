@@ -50,6 +50,16 @@ struct FilterState {
   bool diverged = false;
 };
 
+/// What a step has done, as the smoother needs it. Normalised units.
+struct StepTrace {
+  bool linked = false;           ///< x⁻ came from the state before by f; else the filter began (anew)
+  Eigen::VectorXd prior;         ///< x⁻, where linked
+  Eigen::MatrixXd F;             ///< of f, where linked
+  double widening = 1;           ///< P⁻ = λ (F P⁺ Fᵀ + Q), see WideningFor
+  Eigen::VectorXd input;         ///< u of the sample
+  bool warming_up = false;       ///< Case I: there is no state yet
+};
+
 /// An extended Kalman filter on a neural state-space model, one sample at a time.
 ///
 ///   x⁻ = f(x⁺, u_{t−1})      P⁻ = F P⁺ Fᵀ + Q          from the second sample on
@@ -84,6 +94,13 @@ class Ekf {
   absl::Status Step(const Eigen::Ref<const Eigen::VectorXd>& input, const Eigen::Ref<const Eigen::VectorXd>& output,
                     FilterModel::Scratch* scratch, Estimate* estimate, const Eigen::MatrixXd* measurement_cov = nullptr);
 
+  /// Steps from now on write what they do into `trace`, until another is set; null: no more. It must outlive those steps.
+  void set_trace(StepTrace* trace) { trace_ = trace; }
+
+  /// Mean and covariance of what is estimated, in physical units, for a state N(mean, factor factorᵀ) in normalised units.
+  void Describe(const Eigen::VectorXd& mean, const Eigen::MatrixXd& factor, const Eigen::VectorXd& input,
+                FilterModel::Scratch* scratch, Estimate* estimate);
+
   const FilterState& state() const { return state_; }
   /// Goes on from a state of a filter of the same model and options.
   void Restore(FilterState state) { state_ = std::move(state); }
@@ -98,6 +115,9 @@ class Ekf {
   absl::StatusOr<std::vector<Estimate>> Forecast(const Eigen::MatrixXd& inputs, FilterModel::Scratch* scratch) const;
 
   int32_t estimate_size() const { return case_one_ ? output_size_ : state_size_; }
+  const Eigen::MatrixXd& process_factor() const { return process_factor_; }
+  /// The set of the state in normalised units; null without one.
+  const physics::Polyhedron* normalised_set() const { return normalised_set_ ? &*normalised_set_ : nullptr; }
   int32_t input_size() const { return input_size_; }
   int32_t output_size() const { return output_size_; }
   /// Whether estimates come with slack and projection.
@@ -115,7 +135,6 @@ class Ekf {
   void WriteInnovation(Estimate* estimate) const;
   void LeaveOutliersOut(const Eigen::MatrixXd& R, Estimate* estimate);
   void Restart();
-  void WriteEstimate(FilterModel::Scratch* scratch, Estimate* estimate);
   void JudgeHealth(Estimate* estimate);
   bool warming_up() const { return case_one_ && state_.window.size() < window_size_; }
 
@@ -137,6 +156,7 @@ class Ekf {
   bool restart_after_divergence_ = true;
 
   FilterState state_;
+  StepTrace* trace_ = nullptr;
   // Scratch of a step, sized once.
   Eigen::VectorXd u_, y_, value_, h_, whitened_;
   std::vector<Eigen::Index> measured_;  // components of y, those that are
