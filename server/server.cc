@@ -111,6 +111,7 @@ class Server::Parts {
     services.push_back(MakeTrainingService(context));
     services.push_back(MakeAdaptationService(context));
     services.push_back(MakePredictionService(context));
+    services.push_back(MakeSmoothingService(context));
     services.push_back(MakeServerService(context));
   }
 

@@ -27,6 +27,7 @@ struct Flags {
   int32_t recover_after = 0;
   bool stay_diverged = false;
   double max_lag_s = 0;
+  bool smooth = false;
 };
 
 /// What is kept of the estimates for the plot.
@@ -134,7 +135,7 @@ absl::StatusOr<SampleSender> OpenData(const Flags& flags, const TargetModel& mod
                             flags.data, options);
 }
 
-void PrintSummary(Console& console, const Summary& summary, const client::SessionInfo& info) {
+void PrintSummary(Console& console, const Summary& summary, size_t output_size, const std::string& session) {
   const double nis_count = static_cast<double>(summary.nis_count);
   PrintRecord(console, {{"samples", summary.samples},
                         {"missing", summary.missing},
@@ -142,23 +143,76 @@ void PrintSummary(Console& console, const Summary& summary, const client::Sessio
                         {"delayed", summary.delayed},
                         {"reset", summary.reset},
                         {"mean_nis", summary.nis_sum / nis_count},
-                        {"expected_nis", info.output_size},
+                        {"expected_nis", output_size},
                         {"health", HealthWord(summary.health)},
-                        {"session", info.session}});
+                        {"session", session}});
+}
+
+absl::StatusOr<client::NoiseSettings> ReadNoise(const Flags& flags) {
+  if (flags.noise.empty()) return client::NoiseSettings();
+  METAEKF_ASSIGN_OR_RETURN(const std::string text, ReadFile(flags.noise));
+  return ToAbsl(client::ParseNoiseSettings(text, flags.noise));
+}
+
+client::GateSettings Gate(const Flags& flags) {
+  return {.probability = std::max(0.0, flags.gate), .recover_after = flags.recover_after, .off = flags.gate == 0};
+}
+
+/// All rows of a file at once, each estimated from all of them.
+absl::Status EstimateSmoothly(const Flags& flags, Console& console) {
+  if (flags.data == "-") return UsageError("--smooth needs the whole recording: give it as --data FILE");
+  METAEKF_ASSIGN_OR_RETURN(const TargetModel model, DescribeTarget(console, flags.target));
+  METAEKF_ASSIGN_OR_RETURN(data::CsvOptions columns, ModelColumns(flags.columns, model, false));
+  columns.allow_missing_outputs = true;
+  if (!flags.plot.empty()) columns.states = FreeColumns(flags.columns).states;
+  METAEKF_ASSIGN_OR_RETURN(const data::Dataset data, ReadData({flags.data}, columns));
+  if (data.trajectories.size() != 1) {
+    return absl::InvalidArgumentError(absl::StrCat(flags.data, " holds ", data.trajectories.size(),
+                                                   " trajectories; a filter follows one system: give each a file of its own"));
+  }
+  data::Trajectory trajectory = data.trajectories.front();
+  SentRows rows{data.output_names, data.state_names, {}, {}};
+  for (Eigen::Index t = 0; t < trajectory.length(); ++t) {
+    rows.outputs.emplace_back(trajectory.outputs.col(t));
+    rows.states.emplace_back(trajectory.states.col(t));
+  }
+  trajectory.states.resize(0, trajectory.length());  // not what is estimated from
+  client::SmoothingRequest request{.target = flags.target, .gate = Gate(flags), .trajectory = ToClient(trajectory)};
+  METAEKF_ASSIGN_OR_RETURN(request.noise, ReadNoise(flags));
+  METAEKF_ASSIGN_OR_RETURN(const client::Smoothed smoothed, ToAbsl(console.client().Smooth(request)));
+
+  const size_t n = smoothed.estimated.size();
+  std::string text = EstimateHeader(smoothed.estimated, model.version.estimates_states, smoothed.constrained);
+  History history;
+  history.means.resize(n);
+  history.std_devs.resize(n);
+  Summary summary;
+  for (const client::EstimateBatch& batch : smoothed.batches) {
+    METAEKF_RETURN_IF_ERROR(CheckShape(batch, n));
+    for (size_t i = 0; i < batch.samples; ++i) text += EstimateRow(batch, i);
+    summary.Add(batch);
+    Keep(batch, history);
+  }
+  if (flags.out == "-") {
+    console.out << text;
+  } else {
+    METAEKF_RETURN_IF_ERROR(WriteFile(flags.out, text));
+    PrintSummary(console, summary, model.version.channels.outputs.size(), "");
+  }
+  if (flags.plot.empty()) return absl::OkStatus();
+  return Plot(flags.plot, "Smoothed estimates with " + model.label, model, smoothed.estimated, history, rows);
 }
 
 absl::Status Estimate(const Flags& flags, Console& console) {
+  if (flags.smooth) return EstimateSmoothly(flags, console);
   METAEKF_ASSIGN_OR_RETURN(const TargetModel model, DescribeTarget(console, flags.target));
   client::EstimationOptions options{.target = flags.target,
                                     .sample_period_s = flags.columns.sample_period_s,
+                                    .max_lag_s = flags.max_lag_s,
+                                    .gate = Gate(flags),
+                                    .stay_diverged = flags.stay_diverged,
                                     .max_in_flight = kMaxInFlight};
-  options.gate = {.probability = std::max(0.0, flags.gate), .recover_after = flags.recover_after, .off = flags.gate == 0};
-  options.stay_diverged = flags.stay_diverged;
-  options.max_lag_s = flags.max_lag_s;
-  if (!flags.noise.empty()) {
-    METAEKF_ASSIGN_OR_RETURN(const std::string text, ReadFile(flags.noise));
-    METAEKF_ASSIGN_OR_RETURN(options.noise, ToAbsl(client::ParseNoiseSettings(text, flags.noise)));
-  }
+  METAEKF_ASSIGN_OR_RETURN(options.noise, ReadNoise(flags));
   METAEKF_ASSIGN_OR_RETURN(SampleSender sender, OpenData(flags, model, console));
   METAEKF_ASSIGN_OR_RETURN(std::unique_ptr<client::EstimationSession> opened,
                            ToAbsl(console.client().OpenEstimation(options)));
@@ -188,7 +242,7 @@ absl::Status Estimate(const Flags& flags, Console& console) {
     METAEKF_RETURN_IF_ERROR(Plot(flags.plot, "Estimates with " + model.label, model, info.estimated,
                                  history, sender.rows()));
   }
-  if (flags.out != "-") PrintSummary(console, summary, info);
+  if (flags.out != "-") PrintSummary(console, summary, info.output_size, info.session);
   return absl::OkStatus();
 }
 
@@ -205,6 +259,8 @@ void AddEstimate(CLI::App& app, Console& console, Command& chosen) {
   command->add_option("--plot", flags->plot, "SVG file: estimates with bands of two sigma");
   command->add_option("--noise", flags->noise,
                       "NoiseSettings as protobuf text: Q, R, initial mean and covariance");
+  command->add_flag("--smooth", flags->smooth,
+                    "Estimate every sample of a file from all of them, by a fixed-interval smoother");
   command->add_option("--gate", flags->gate,
                       "Probability with which a right measurement passes the outlier gate (default 0.999999); 0: no gate")
       ->check(CLI::Range(0.0, 0.999999999999));

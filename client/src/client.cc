@@ -33,7 +33,8 @@ Client::Impl::Impl(const Options& client_options)
       training(v1::TrainingService::NewStub(channel)),
       adaptations(v1::AdaptationService::NewStub(channel)),
       predictions(v1::PredictionService::NewStub(channel)),
-      estimation(v1::EstimationService::NewStub(channel)) {}
+      estimation(v1::EstimationService::NewStub(channel)),
+      smoothing(v1::SmoothingService::NewStub(channel)) {}
 
 Status Client::Impl::Translate(const grpc::Status& status) const {
   Status result = FromGrpc(status);

@@ -227,6 +227,12 @@ NoiseSettings FromProto(const v1::NoiseSettings& message) {
           ToVector(message.initial_mean()), ToVector(message.initial_cov())};
 }
 
+void ToProto(const GateSettings& gate, v1::GateSettings* message) {
+  message->set_probability(gate.probability);
+  message->set_recover_after(gate.recover_after);
+  message->set_off(gate.off);
+}
+
 void ToProto(const Channels& channels, v1::Channels* message) {
   AddChannels(channels.inputs, message->mutable_inputs());
   AddChannels(channels.outputs, message->mutable_outputs());

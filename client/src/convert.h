@@ -27,6 +27,7 @@ NoiseSettings FromProto(const v1::NoiseSettings& message);
 
 void ToProto(const Channels& channels, v1::Channels* message);
 void ToProto(const NoiseSettings& noise, v1::NoiseSettings* message);
+void ToProto(const GateSettings& gate, v1::GateSettings* message);
 void ToProto(const InnerLoop& inner_loop, v1::InnerLoopSpec* message);
 v1::Adaptation::Method ToProto(std::optional<AdaptationMethod> method);
 v1::OpenSession::CovarianceFormat ToProto(CovarianceFormat format);

@@ -219,9 +219,7 @@ Result<std::unique_ptr<EstimationSession>> Client::OpenEstimation(
   open->set_send_innovations(options.send_innovations);
   open->set_sample_period_s(options.sample_period_s);
   open->set_max_lag_s(options.max_lag_s);
-  open->mutable_gate()->set_probability(options.gate.probability);
-  open->mutable_gate()->set_recover_after(options.gate.recover_after);
-  open->mutable_gate()->set_off(options.gate.off);
+  ToProto(options.gate, open->mutable_gate());
   open->set_stay_diverged(options.stay_diverged);
 
   auto impl = std::make_unique<EstimationSession::Impl>();

@@ -19,6 +19,7 @@
 #include "metaekf/v1/model.grpc.pb.h"
 #include "metaekf/v1/prediction.grpc.pb.h"
 #include "metaekf/v1/server_info.grpc.pb.h"
+#include "metaekf/v1/smoothing.grpc.pb.h"
 #include "metaekf/v1/training.grpc.pb.h"
 
 /// Assigns what `expression` (a client::Result) holds to `target`, or returns its error.
@@ -109,6 +110,7 @@ struct Client::Impl {
   std::unique_ptr<v1::AdaptationService::Stub> adaptations;
   std::unique_ptr<v1::PredictionService::Stub> predictions;
   std::unique_ptr<v1::EstimationService::Stub> estimation;
+  std::unique_ptr<v1::SmoothingService::Stub> smoothing;
 };
 
 }  // namespace metaekf::client

@@ -15,6 +15,7 @@ std::unique_ptr<grpc::Service> MakeModelService(const ServiceContext& context);
 std::unique_ptr<grpc::Service> MakeTrainingService(const ServiceContext& context);
 std::unique_ptr<grpc::Service> MakeAdaptationService(const ServiceContext& context);
 std::unique_ptr<grpc::Service> MakePredictionService(const ServiceContext& context);
+std::unique_ptr<grpc::Service> MakeSmoothingService(const ServiceContext& context);
 std::unique_ptr<grpc::Service> MakeServerService(const ServiceContext& context);
 
 }  // namespace metaekf::server

@@ -11,13 +11,12 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-namespace {
-
-absl::Status ReadNoise(const v1::NoiseSettings& noise, Index n, Index n_y, filter::FilterOptions* options) {
-  const auto read = [](const std::string& name, const google::protobuf::RepeatedField<double>& values, Index size,
+absl::Status ReadNoise(const std::string& field, const v1::NoiseSettings& noise, Index n, Index n_y,
+                       filter::FilterOptions* options) {
+  const auto read = [&field](const std::string& name, const google::protobuf::RepeatedField<double>& values, Index size,
                        std::optional<MatrixXd>* cov) -> absl::Status {
     if (values.empty()) return absl::OkStatus();
-    METAEKF_ASSIGN_OR_RETURN(*cov, ReadCovariance("open.noise." + name, values.data(), values.size(), size));
+    METAEKF_ASSIGN_OR_RETURN(*cov, ReadCovariance(field + "." + name, values.data(), values.size(), size));
     return absl::OkStatus();
   };
   METAEKF_RETURN_IF_ERROR(read("process_noise_cov", noise.process_noise_cov(), n, &options->process_cov));
@@ -29,26 +28,24 @@ absl::Status ReadNoise(const v1::NoiseSettings& noise, Index n, Index n_y, filte
   return absl::OkStatus();
 }
 
-absl::Status ReadGate(const v1::GateSettings& gate, filter::GateOptions* options) {
+absl::Status ReadGate(const std::string& field, const v1::GateSettings& gate, filter::GateOptions* options) {
   if (gate.off()) {
     options->probability = 0;
     return absl::OkStatus();
   }
   if (gate.probability() != 0) {
     if (!(gate.probability() > 0 && gate.probability() < 1)) {
-      return FieldViolation("open.gate.probability",
+      return FieldViolation(field + ".probability",
                             absl::StrCat("must be between 0 and 1, got ", base::FormatExact(gate.probability())));
     }
     options->probability = gate.probability();
   }
   if (gate.recover_after() < 0) {
-    return FieldViolation("open.gate.recover_after", absl::StrCat("must be at least 1, or 0 for the default, got ", gate.recover_after()));
+    return FieldViolation(field + ".recover_after", absl::StrCat("must be at least 1, or 0 for the default, got ", gate.recover_after()));
   }
   if (gate.recover_after() > 0) options->recover_after = gate.recover_after();
   return absl::OkStatus();
 }
-
-}  // namespace
 
 absl::StatusOr<MatrixXd> ReadCovariance(const std::string& field, const double* values, Index count, Index n) {
   MatrixXd cov = MatrixXd::Zero(n, n);
@@ -64,13 +61,6 @@ absl::StatusOr<MatrixXd> ReadCovariance(const std::string& field, const double* 
     for (Index j = 0; j <= i; ++j, ++at) cov(i, j) = cov(j, i) = values[at];
   }
   return cov;
-}
-
-absl::StatusOr<filter::FilterOptions> ReadFilterOptions(const v1::OpenSession& open, Index n, Index n_y) {
-  filter::FilterOptions options{.restart_after_divergence = !open.stay_diverged()};
-  METAEKF_RETURN_IF_ERROR(ReadNoise(open.noise(), n, n_y, &options));
-  METAEKF_RETURN_IF_ERROR(ReadGate(open.gate(), &options.gate));
-  return options;
 }
 
 }  // namespace metaekf::server

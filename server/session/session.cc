@@ -29,22 +29,6 @@ constexpr int64_t kMaxMissedPeriods = 100'000;
 constexpr int64_t kMaxLag = 1000;              // periods
 constexpr int64_t kMaxRemembered = 64 << 20;   // bytes
 
-EstimateBatch::Health ToMessage(filter::Health health) {
-  switch (health) {
-    case filter::Health::kWarmingUp:
-      return EstimateBatch::WARMING_UP;
-    case filter::Health::kConsistent:
-      return EstimateBatch::CONSISTENT;
-    case filter::Health::kOverconfident:
-      return EstimateBatch::OVERCONFIDENT;
-    case filter::Health::kUnderconfident:
-      return EstimateBatch::UNDERCONFIDENT;
-    case filter::Health::kDiverged:
-      return EstimateBatch::DIVERGED;
-  }
-  return EstimateBatch::HEALTH_UNSPECIFIED;
-}
-
 /// Periods that a measurement may come late. Errors: InvalidArgument for a lag that is negative or too long to remember.
 absl::StatusOr<int64_t> ReadLag(const OpenSession& open, double period_s, const filter::Ekf& ekf) {
   const double periods = std::floor(open.max_lag_s() / period_s + kTimeTolerance);
@@ -59,12 +43,6 @@ absl::StatusOr<int64_t> ReadLag(const OpenSession& open, double period_s, const 
                                                          " sample periods can be remembered, got ", lag));
   }
   return lag;
-}
-
-void AddLowerTriangle(const MatrixXd& matrix, google::protobuf::RepeatedField<double>* values) {
-  for (Index i = 0; i < matrix.rows(); ++i) {
-    for (Index j = 0; j <= i; ++j) values->Add(matrix(i, j));
-  }
 }
 
 /// R of one of the rows of a batch that brings them.
@@ -92,7 +70,7 @@ absl::StatusOr<std::unique_ptr<Session>> Session::Open(std::shared_ptr<const Ser
   }
   METAEKF_ASSIGN_OR_RETURN(
       const filter::FilterOptions options,
-      ReadFilterOptions(open, model->filter_model->state_size(), bundle.model.spec().output_size));
+      ReadFilterOptions("open", open, model->filter_model->state_size(), bundle.model.spec().output_size));
   absl::StatusOr<filter::Ekf> ekf = filter::Ekf::Create(bundle, model->filter_model, model->filter_parameters, options);
   if (!ekf.ok()) return FieldViolation("open.noise", std::string(ekf.status().message()));
   METAEKF_ASSIGN_OR_RETURN(const int64_t lag, ReadLag(open, bundle.sample_period_s, *ekf));
@@ -103,10 +81,11 @@ Session::Session(std::shared_ptr<const ServedModel> model, filter::ReplayFilter 
     : model_(std::move(model)),
       filter_(std::move(filter)),
       estimate_(filter_.ekf().MakeEstimate()),
-      covariance_format_(open.covariance_format() == OpenSession::COVARIANCE_FORMAT_UNSPECIFIED
-                             ? OpenSession::NONE
-                             : open.covariance_format()),
-      send_innovations_(open.send_innovations()),
+      format_{.covariance = open.covariance_format() == OpenSession::COVARIANCE_FORMAT_UNSPECIFIED
+                                ? OpenSession::NONE
+                                : open.covariance_format(),
+              .innovations = open.send_innovations(),
+              .constrained = filter_.ekf().constrained()},
       period_s_(model_->bundle.sample_period_s) {}
 
 void Session::Describe(v1::SessionOpened* opened) const {
@@ -120,9 +99,9 @@ void Session::Describe(v1::SessionOpened* opened) const {
     opened->add_estimated()->set_name(name);
   }
   opened->set_sample_period_s(period_s_);
-  opened->set_covariance_format(covariance_format_);
-  opened->set_send_innovations(send_innovations_);
-  opened->set_constrained(filter_.ekf().constrained());
+  opened->set_covariance_format(format_.covariance);
+  opened->set_send_innovations(format_.innovations);
+  opened->set_constrained(format_.constrained);
 }
 
 absl::Status Session::Check(const v1::SampleBatch& batch, int64_t rows) const {
@@ -248,36 +227,12 @@ absl::Status Session::ApplyRow(const v1::SampleBatch& batch, int64_t row, filter
   }
   ++seq_;
   if (estimates->times_s().empty()) estimates->set_first_seq(seq_);
-  Append(time, output, periods < 1, estimates);
-  return absl::OkStatus();
-}
-
-void Session::Append(double time_s, const double* output, bool delayed, EstimateBatch* estimates) const {
-  estimates->add_times_s(time_s);
-  estimates->mutable_means()->Add(estimate_.mean.begin(), estimate_.mean.end());
-  if (covariance_format_ == OpenSession::DIAGONAL) {
-    for (Index i = 0; i < estimate_.cov.rows(); ++i) estimates->add_covariances(estimate_.cov(i, i));
-  } else if (covariance_format_ == OpenSession::LOWER_TRIANGLE) {
-    AddLowerTriangle(estimate_.cov, estimates->mutable_covariances());
-  }
-  if (send_innovations_) {
-    estimates->mutable_innovations()->Add(estimate_.innovation.begin(), estimate_.innovation.end());
-    AddLowerTriangle(estimate_.innovation_cov, estimates->mutable_innovation_covs());
-  }
-  estimates->add_nis(estimate_.nis);
-  estimates->add_health(ToMessage(estimate_.health));
   bool missing = false;
-  for (int32_t i = 0; i < filter_.ekf().output_size(); ++i) missing = missing || std::isnan(output[i]);
+  for (int64_t i = 0; i < n_y; ++i) missing = missing || std::isnan(output[i]);
   uint32_t flags = missing ? EstimateBatch::MISSING : EstimateBatch::NO_FLAG;
-  if (estimate_.gated > 0) flags |= EstimateBatch::GATED;
-  if (estimate_.reset) flags |= EstimateBatch::RESET;
-  if (delayed) flags |= EstimateBatch::DELAYED;
-  if (filter_.ekf().constrained()) {
-    if (estimate_.projection > 0) flags |= EstimateBatch::PROJECTED;
-    estimates->add_slacks(estimate_.slack);
-    estimates->add_projections(estimate_.projection);
-  }
-  estimates->add_flags(flags);
+  if (periods < 1) flags |= EstimateBatch::DELAYED;
+  WriteEstimate(format_, time, estimate_, flags, estimates);
+  return absl::OkStatus();
 }
 
 std::string Session::Checkpoint() const {

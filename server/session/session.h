@@ -8,6 +8,7 @@
 #include "core/filter/replay.h"
 #include "metaekf/v1/estimation.pb.h"
 #include "server/serving/model_cache.h"
+#include "server/session/write_estimate.h"
 
 namespace metaekf::server {
 
@@ -43,13 +44,11 @@ class Session {
   absl::StatusOr<int64_t> PeriodsTo(double time_s, double last_time_s, int64_t remembered) const;
   absl::Status ApplyRow(const v1::SampleBatch& batch, int64_t row, filter::FilterModel::Scratch* scratch,
                         v1::EstimateBatch* estimates);
-  void Append(double time_s, const double* output, bool delayed, v1::EstimateBatch* estimates) const;
 
   const std::shared_ptr<const ServedModel> model_;
   filter::ReplayFilter filter_;
   filter::Estimate estimate_;
-  const v1::OpenSession::CovarianceFormat covariance_format_;
-  const bool send_innovations_;
+  const EstimateFormat format_;
   const double period_s_;
   uint64_t seq_ = 0;    // the last sample applied
   double time_s_ = 0;   // of the newest

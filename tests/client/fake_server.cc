@@ -14,6 +14,7 @@
 #include "metaekf/v1/estimation.grpc.pb.h"
 #include "metaekf/v1/model.grpc.pb.h"
 #include "metaekf/v1/prediction.grpc.pb.h"
+#include "metaekf/v1/smoothing.grpc.pb.h"
 #include "metaekf/v1/server_info.grpc.pb.h"
 #include "metaekf/v1/training.grpc.pb.h"
 
@@ -267,6 +268,37 @@ class PredictionService : public v1::PredictionService::Service {
   FakePredictions& fake_;
 };
 
+class SmoothingService : public v1::SmoothingService::Service {
+ public:
+  explicit SmoothingService(FakeSmoothing& fake) : fake_(fake) {}
+
+  grpc::Status Smooth(grpc::ServerContext*,
+                      grpc::ServerReaderWriter<v1::SmoothResponse, v1::SmoothRequest>* stream) override {
+    v1::SmoothRequest request;
+    stream->Read(&request);
+    fake_.header = request.header();
+    v1::SmoothResponse response;
+    *response.add_estimated() = fake_.estimated;
+    v1::EstimateBatch& estimates = *response.mutable_estimates();
+    while (stream->Read(&request)) {
+      response.set_trajectory(request.samples().trajectory());
+      for (const double y : request.samples().outputs()) {
+        estimates.add_times_s(0.5 * estimates.times_s_size());
+        estimates.add_means(std::isnan(y) ? 7 : y);
+        estimates.add_covariances(0.25);
+        estimates.add_nis(1.5);
+        estimates.add_health(v1::EstimateBatch::CONSISTENT);
+        estimates.add_flags(std::isnan(y) ? v1::EstimateBatch::MISSING : v1::EstimateBatch::NO_FLAG);
+      }
+    }
+    stream->Write(response);
+    return grpc::Status::OK;
+  }
+
+ private:
+  FakeSmoothing& fake_;
+};
+
 class EstimationService : public v1::EstimationService::Service {
  public:
   explicit EstimationService(FakeEstimation& fake) : fake_(fake) {}
@@ -405,6 +437,7 @@ struct FakeServer::Services {
         adaptations(fake.adaptations),
         predictions(fake.predictions),
         estimation(fake.estimation),
+        smoothing(fake.smoothing),
         info(fake.info) {}
 
   ModelService models;
@@ -412,18 +445,19 @@ struct FakeServer::Services {
   AdaptationService adaptations;
   PredictionService predictions;
   EstimationService estimation;
+  SmoothingService smoothing;
   ServerService info;
   std::unique_ptr<grpc::Server> server;
 };
 
 FakeServer::FakeServer() : services_(std::make_unique<Services>(*this)) {
-  estimation.estimated = models.version.channels().outputs(0);
+  estimation.estimated = smoothing.estimated = models.version.channels().outputs(0);
   int port = 0;
   grpc::ServerBuilder builder;
   builder.AddListeningPort("127.0.0.1:0", grpc::InsecureServerCredentials(), &port);
   for (grpc::Service* service : std::initializer_list<grpc::Service*>{
            &services_->models, &services_->training, &services_->adaptations,
-           &services_->predictions, &services_->estimation, &services_->info}) {
+           &services_->predictions, &services_->estimation, &services_->smoothing, &services_->info}) {
     builder.RegisterService(service);
   }
   services_->server = builder.BuildAndStart();

@@ -9,6 +9,7 @@
 #include "metaekf/v1/estimation.pb.h"
 #include "metaekf/v1/model.pb.h"
 #include "metaekf/v1/prediction.pb.h"
+#include "metaekf/v1/smoothing.pb.h"
 #include "metaekf/v1/server_info.pb.h"
 #include "metaekf/v1/training.pb.h"
 
@@ -75,6 +76,12 @@ struct FakeEstimation {
   int stop_after_batches = 0;  // 0: never
 };
 
+/// Estimates as those of FakeEstimation, all in one response.
+struct FakeSmoothing {
+  v1::SmoothRequest::Header header;
+  v1::Channel estimated;
+};
+
 struct FakeInfo {
   FakeInfo();
   v1::ServerInfo info;
@@ -97,6 +104,7 @@ class FakeServer {
   FakeAdaptations adaptations;
   FakePredictions predictions;
   FakeEstimation estimation;
+  FakeSmoothing smoothing;
   FakeInfo info;
 
  private:

@@ -17,7 +17,7 @@ TEST_F(RunningServerTest, HealthAndReflectionAnswer) {
   EXPECT_EQ(client_->Health(), "SERVING");
   const std::string services = client_->ReflectedServices();
   for (const char* name : {"ModelService", "TrainingService", "AdaptationService",
-                           "PredictionService", "EstimationService", "ServerService"}) {
+                           "PredictionService", "SmoothingService", "EstimationService", "ServerService"}) {
     EXPECT_THAT(services, HasSubstr(std::string("metaekf.v1.") + name));
   }
 }

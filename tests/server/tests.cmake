@@ -13,7 +13,7 @@ target_compile_definitions(metaekf_server_test_support
   INTERFACE METAEKFD_BINARY="$<TARGET_FILE:metaekfd>")
 add_dependencies(metaekf_server_test_support metaekfd)  # the workers of jobs
 
-foreach(test adaptation_service model_service prediction_service training_service)
+foreach(test adaptation_service model_service prediction_service smoothing_service training_service)
   metaekf_test(server/handlers/${test}_test.cc DEPS metaekf::server_test_support)
 endforeach()
 metaekf_test(server/server_test.cc DEPS metaekf::server_test_support)

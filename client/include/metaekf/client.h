@@ -323,6 +323,21 @@ struct EstimateBatch {
   std::vector<double> slacks, projections;
 };
 
+struct SmoothingRequest {
+  Target target;
+  NoiseSettings noise;
+  GateSettings gate;
+  CovarianceFormat covariance = CovarianceFormat::kDiagonal;
+  Trajectory trajectory;  ///< NaN in outputs: not measured
+};
+
+/// Estimates given a whole recording; NIS, health and flags as the filter had them.
+struct Smoothed {
+  std::vector<Channel> estimated;  ///< states (Case II) or outputs (Case I)
+  bool constrained = false;
+  std::vector<EstimateBatch> batches;  ///< in order, all samples
+};
+
 struct Options {
   std::string server = "127.0.0.1:50051";  ///< HOST:PORT
   double timeout_s = 20;                   ///< of calls that ask one thing and get one answer
@@ -390,6 +405,9 @@ class Client {
   /// have been answered.
   Result<std::vector<Prediction>> Predict(
       const PredictionRequest& request, const std::function<void(uint64_t samples)>& on_rows = {});
+
+  /// Estimates of a recording from the whole of it.
+  Result<Smoothed> Smooth(const SmoothingRequest& request);
 
   Result<std::unique_ptr<EstimationSession>> OpenEstimation(const EstimationOptions& options);
   /// Goes on with a session, e.g. after a restart: samples from info().durable_seq + 1 on are to be

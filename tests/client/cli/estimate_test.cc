@@ -66,6 +66,28 @@ TEST_F(EstimateTest, GateAndLagAreAskedFor) {
   EXPECT_EQ(Run({"--gate", "1.5"}, late).status, 2);
 }
 
+TEST_F(EstimateTest, SmoothsAWholeFile) {
+  const std::string data = TempFile("smooth.csv", "t,u1,y1\n0,0,1\n0.5,0,\n1,0,3\n");
+  const Outcome outcome = Run({"--smooth", "--gate", "0.9", "--data", data});
+  ASSERT_EQ(outcome.status, 0) << outcome.err;
+  EXPECT_EQ(outcome.out, std::string(kHeader) +
+                             "0,1,0.5,1.5,consistent,\n"
+                             "0.5,7,0.5,1.5,consistent,missing\n"
+                             "1,3,0.5,1.5,consistent,\n");
+  EXPECT_EQ(server_.smoothing.header.target(), "models/vdp");
+  EXPECT_EQ(server_.smoothing.header.gate().probability(), 0.9);
+  const Outcome to_files = Run({"--smooth", "--data", data, "--out", TempPath("s.csv"), "--plot", TempPath("s.svg")});
+  ASSERT_EQ(to_files.status, 0) << to_files.err;
+  EXPECT_EQ(Contents(TempPath("s.csv")), outcome.out);
+  EXPECT_THAT(Contents(TempPath("s.svg")), HasSubstr("Smoothed"));
+  EXPECT_THAT(to_files.out, HasSubstr("consistent"));
+
+  EXPECT_EQ(Run({"--smooth"}, "u1,y1\n0,1\n").status, 2);
+  const Outcome two = Run({"--smooth", "--data", TempFile("two.csv", "trajectory,u1,y1\na,0,1\nb,0,1\n")});
+  EXPECT_EQ(two.status, 1);
+  EXPECT_THAT(two.err, HasSubstr("holds 2 trajectories"));
+}
+
 TEST_F(EstimateTest, PlotsEstimatesWithTheirBandAndTheTruth) {
   const std::string plot = TempPath("plot.svg");
   ASSERT_EQ(Run({"--plot", plot}, "u1,y1\n0,1\n0,2\n0,3\n").status, 0);

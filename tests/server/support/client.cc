@@ -11,6 +11,7 @@
 #include "metaekf/v1/adaptation.grpc.pb.h"
 #include "metaekf/v1/model.grpc.pb.h"
 #include "metaekf/v1/prediction.grpc.pb.h"
+#include "metaekf/v1/smoothing.grpc.pb.h"
 #include "metaekf/v1/server_info.grpc.pb.h"
 #include "metaekf/v1/training.grpc.pb.h"
 
@@ -97,6 +98,7 @@ class Client::Stubs {
         training(v1::TrainingService::NewStub(channel)),
         adaptations(v1::AdaptationService::NewStub(channel)),
         predictions(v1::PredictionService::NewStub(channel)),
+        smoothing(v1::SmoothingService::NewStub(channel)),
         server(v1::ServerService::NewStub(channel)),
         health(grpc::health::v1::Health::NewStub(channel)) {}
 
@@ -105,6 +107,7 @@ class Client::Stubs {
   std::unique_ptr<v1::TrainingService::Stub> training;
   std::unique_ptr<v1::AdaptationService::Stub> adaptations;
   std::unique_ptr<v1::PredictionService::Stub> predictions;
+  std::unique_ptr<v1::SmoothingService::Stub> smoothing;
   std::unique_ptr<v1::ServerService::Stub> server;
   std::unique_ptr<grpc::health::v1::Health::Stub> health;
 };
@@ -180,6 +183,11 @@ Reply<std::vector<v1::PredictResponse>> Client::Predict(
     const std::vector<v1::PredictRequest>& requests) {
   return Bidi<v1::PredictResponse>(
       requests, [this](auto* context) { return stubs_->predictions->Predict(context); }, {});
+}
+
+Reply<std::vector<v1::SmoothResponse>> Client::Smooth(const std::vector<v1::SmoothRequest>& requests) {
+  return Bidi<v1::SmoothResponse>(
+      requests, [this](auto* context) { return stubs_->smoothing->Smooth(context); }, {});
 }
 
 std::string Client::Health() {

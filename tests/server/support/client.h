@@ -12,6 +12,7 @@
 #include "metaekf/v1/model.pb.h"
 #include "metaekf/v1/prediction.pb.h"
 #include "metaekf/v1/server_info.pb.h"
+#include "metaekf/v1/smoothing.pb.h"
 #include "metaekf/v1/training.pb.h"
 
 namespace metaekf::server {
@@ -75,6 +76,7 @@ class Client {
   Reply<Empty> Call(const v1::DeleteAdaptationRequest& request);
 
   Reply<std::vector<v1::PredictResponse>> Predict(const std::vector<v1::PredictRequest>& requests);
+  Reply<std::vector<v1::SmoothResponse>> Smooth(const std::vector<v1::SmoothRequest>& requests);
   Reply<v1::ServerInfo> Call(const v1::GetServerInfoRequest& request);
 
   /// grpc.health.v1: "SERVING", "NOT_SERVING", or the name of the error's code.

@@ -1,0 +1,116 @@
+#include "core/filter/smoother.h"
+
+#include <algorithm>
+#include <cmath>
+#include <optional>
+#include <utility>
+
+#include "absl/strings/str_cat.h"
+#include "core/base/status.h"
+#include "server/convert/samples.h"
+#include "server/handlers/smoothing_handlers.h"
+#include "server/session/read_options.h"
+#include "server/session/write_estimate.h"
+#include "server/status/details.h"
+
+namespace metaekf::server {
+namespace {
+
+using Request = v1::SmoothRequest;
+using Response = v1::SmoothResponse;
+using Sink = ResponseSink<Response>;
+
+constexpr size_t kValuesPerResponse = 16'384;
+
+class SmoothCall final : public StreamHandler<Request, Response> {
+ public:
+  explicit SmoothCall(const ServiceContext& context) : context_(context) {}
+
+  absl::Status OnRequest(Request& request, Sink& sink) override {
+    if (!assembler_) {
+      if (!request.has_header()) return FieldViolation("header", "must be the first message");
+      return TakeHeader(request.header());
+    }
+    if (!request.has_samples()) {
+      return FieldViolation("samples", "are missing: after the header come samples only");
+    }
+    METAEKF_ASSIGN_OR_RETURN(const auto complete, assembler_->Add(request.samples()));
+    return complete ? SmoothTrajectory(*complete, sink) : absl::OkStatus();
+  }
+
+  absl::Status OnEnd(Sink& sink) override {
+    if (!assembler_) return FieldViolation("header", "is missing");
+    const std::optional<data::Trajectory> last = assembler_->Finish();
+    if (!last) return FieldViolation("samples", "there are none");
+    return SmoothTrajectory(*last, sink);
+  }
+
+ private:
+  absl::Status TakeHeader(const Request::Header& header) {
+    METAEKF_ASSIGN_OR_RETURN(model_, context_.models.Get("header.target", header.target()));
+    const nssm::Bundle& bundle = model_->bundle;
+    METAEKF_ASSIGN_OR_RETURN(ChannelCounts channels, MatchChannels("header.channels", header.channels(), bundle));
+    METAEKF_ASSIGN_OR_RETURN(const filter::FilterOptions options,
+                             ReadFilterOptions("header", header, model_->filter_model->state_size(),
+                                               bundle.model.spec().output_size));
+    absl::StatusOr<filter::Ekf> ekf =
+        filter::Ekf::Create(bundle, model_->filter_model, model_->filter_parameters, options);
+    if (!ekf.ok()) return FieldViolation("header.noise", std::string(ekf.status().message()));
+    ekf_ = *std::move(ekf);
+    format_ = {.covariance = header.covariance_format() == v1::OpenSession::COVARIANCE_FORMAT_UNSPECIFIED
+                                 ? v1::OpenSession::NONE
+                                 : header.covariance_format(),
+               .constrained = ekf_->constrained()};
+    assembler_.emplace(SampleRules{.channels = channels,
+                                   .missing_measurements = true,
+                                   .sample_period_s = bundle.sample_period_s,
+                                   .max_samples = context_.options.limits.samples_per_call});
+    return absl::OkStatus();
+  }
+
+  absl::Status SmoothTrajectory(const data::Trajectory& trajectory, Sink& sink) {
+    const auto scratch = model_->filter_model->MakeScratch();
+    const auto estimates = filter::Smooth(*ekf_, trajectory, scratch.get());
+    if (!estimates.ok()) {
+      return FieldViolation("samples", absl::StrCat("trajectory '", trajectory.name, "': ", estimates.status().message()));
+    }
+    const size_t width = static_cast<size_t>(ekf_->estimate_size());
+    const size_t rows = std::max<size_t>(1, kValuesPerResponse / (width * (width + 3) / 2 + 4));
+    for (size_t first = 0; first < estimates->size(); first += rows) {
+      Response response;
+      response.set_trajectory(trajectory.name);
+      response.mutable_estimates()->set_first_seq(first + 1);
+      for (size_t t = first; t < std::min(first + rows, estimates->size()); ++t) {
+        const Eigen::Index sample = static_cast<Eigen::Index>(t);
+        const uint32_t flags = trajectory.outputs.col(sample).hasNaN() ? v1::EstimateBatch::MISSING : 0;
+        WriteEstimate(format_, trajectory.start_s + static_cast<double>(t) * model_->bundle.sample_period_s, (*estimates)[t],
+                      flags, response.mutable_estimates());
+      }
+      if (first == 0) Introduce(&response);
+      sink.Send(std::move(response));
+    }
+    return absl::OkStatus();
+  }
+
+  void Introduce(Response* response) const {
+    const nssm::Bundle& bundle = model_->bundle;
+    for (const std::string& name : bundle.model.spec().is_case_one() ? bundle.names.outputs : bundle.names.states) {
+      response->add_estimated()->set_name(name);
+    }
+    response->set_constrained(format_.constrained);
+  }
+
+  const ServiceContext& context_;
+  std::shared_ptr<const ServedModel> model_;
+  std::optional<filter::Ekf> ekf_;  // that has applied nothing
+  EstimateFormat format_;
+  std::optional<TrajectoryAssembler> assembler_;  // once the header is there
+};
+
+}  // namespace
+
+std::unique_ptr<StreamHandler<Request, Response>> Smooth(const ServiceContext& context) {
+  return std::make_unique<SmoothCall>(context);
+}
+
+}  // namespace metaekf::server

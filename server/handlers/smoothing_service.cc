@@ -1,0 +1,28 @@
+#include "metaekf/v1/smoothing.grpc.pb.h"
+#include "server/handlers/bidi_call.h"
+#include "server/handlers/smoothing_handlers.h"
+#include "server/handlers/services.h"
+
+namespace metaekf::server {
+namespace {
+
+class SmoothingService final : public v1::SmoothingService::CallbackService {
+ public:
+  explicit SmoothingService(const ServiceContext& context) : context_(context) {}
+
+  grpc::ServerBidiReactor<v1::SmoothRequest, v1::SmoothResponse>* Smooth(
+      grpc::CallbackServerContext* call) override {
+    return new BidiCall(call, server::Smooth(context_), context_.compute, context_.compute);
+  }
+
+ private:
+  const ServiceContext& context_;
+};
+
+}  // namespace
+
+std::unique_ptr<grpc::Service> MakeSmoothingService(const ServiceContext& context) {
+  return std::make_unique<SmoothingService>(context);
+}
+
+}  // namespace metaekf::server
