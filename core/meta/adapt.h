@@ -55,6 +55,8 @@ struct AdaptationResult {
   TailErrors before, after, arx;
   /// kLevenbergMarquardt; of the tensors of `mask`. None of IMPLICIT_MAML's minimum, whose loss is no likelihood.
   std::optional<nssm::GaussianPosterior> posterior;
+  /// Q and R with which a filter explains the tail best, held near the model's own (filter::Calibrate).
+  nssm::FilterNoise noise;
 };
 
 /// Whether `a` is better than `b` in free run, all outputs together (geometric mean of the ratios, for outputs may have

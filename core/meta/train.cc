@@ -2,10 +2,12 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 #include "core/base/numbers.h"
 #include "core/base/status.h"
 #include "core/data/split.h"
+#include "core/filter/calibrate.h"
 #include "core/filter/noise.h"
 #include "core/meta/adapt.h"
 #include "core/meta/empirical_bayes.h"
@@ -72,8 +74,13 @@ std::vector<data::ScaleGroup> ScaleGroups(const ModelSpec& model) {
   return {group};
 }
 
-/// Default Q, R and P₀ from the residuals of the model adapted to each of `systems`.
-absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(const Bundle& bundle, const TrainingSpec& spec,
+/// What a filter of a system is calibrated on: at most so many samples behind its context, or all of a recording that is hardly
+/// longer than that.
+constexpr int64_t kCalibrationSamples = 2000, kFewSamples = 50;
+
+/// Default Q, R and P₀ from the residuals of the model adapted to each of `systems`, Q and R scaled to what filters of these systems
+/// meet after the context (filter::Calibrate).
+absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const TrainingSpec& spec,
                                                        const std::vector<Trajectory>& systems, base::Executor* executor) {
   METAEKF_ASSIGN_OR_RETURN(const AdaptationOptions options, DefaultAdaptation(bundle));
   const int64_t wanted = std::max<int64_t>(spec.context_samples, ContextSamplesNeeded(spec.model, spec.loss));
@@ -85,11 +92,17 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(const Bundle& bundle, con
     parameters[i] = adapted.ok() ? *std::move(adapted) : bundle.parameters;
   });
   filter::NoiseEstimate noise(bundle);
+  std::vector<filter::CalibrationRun> runs;
   for (size_t i = 0; i < systems.size(); ++i) {
     METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, systems[i]));
     noise.Add(parameters[i], normalised);
+    const int64_t begin = systems[i].length() - wanted < kFewSamples ? 0 : wanted;
+    METAEKF_ASSIGN_OR_RETURN(const Trajectory later, data::SamplesFrom(systems[i], begin));
+    METAEKF_ASSIGN_OR_RETURN(Trajectory run, data::FirstSamples(later, std::min<int64_t>(later.length(), kCalibrationSamples)));
+    runs.push_back({parameters[i], std::move(run)});
   }
-  return noise.Result(bundle.normaliser);
+  bundle.noise = noise.Result(bundle.normaliser);
+  return filter::Calibrate(bundle, runs, std::numeric_limits<double>::infinity(), executor);
 }
 
 /// The rates that were learned become part of what the model file says of its training and of adaptation.

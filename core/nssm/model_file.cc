@@ -13,7 +13,8 @@ using base::JsonFields;
 using nlohmann::json;
 
 constexpr char kMetadataKey[] = "metaekf";
-constexpr char kPosteriorName[] = "posterior.information", kCoordinatesName[] = "posterior.coordinates";
+constexpr char kPosteriorName[] = "posterior.information", kCoordinatesName[] = "posterior.coordinates",
+               kProcessNoiseName[] = "noise.process", kMeasurementNoiseName[] = "noise.measurement";
 constexpr char kAdaptedKey[] = "adapted";  // names of the tensors that the coordinates stand for
 constexpr char kPriorPrefix[] = "prior.";
 
@@ -97,6 +98,24 @@ absl::Status StoreTensor(const Safetensors::Tensor& tensor, Bundle* bundle, nn::
     return absl::OkStatus();
   }
   return absl::InvalidArgumentError(absl::StrCat("tensor \"", tensor.name, "\" is not part of the model"));
+}
+
+Safetensors::Tensor TensorOf(const char* name, const Eigen::MatrixXd& cov) {
+  return {.name = name, .shape = {cov.rows(), cov.cols()}, .values = std::vector<double>(cov.reshaped().begin(), cov.reshaped().end())};
+}
+
+/// Replaces a covariance by one of the same size.
+absl::Status StoreNoise(const Safetensors::Tensor& tensor, Eigen::MatrixXd* cov) {
+  const Eigen::Index n = cov->rows();
+  if (tensor.shape != std::vector<int64_t>{n, n}) {
+    return absl::InvalidArgumentError(absl::StrCat("tensor \"", tensor.name, "\" is not ", n, " × ", n));
+  }
+  const Eigen::MatrixXd values = Eigen::Map<const Eigen::MatrixXd>(tensor.values.data(), n, n);
+  if (!values.allFinite() || !values.isApprox(values.transpose(), 1e-9) || (values.diagonal().array() < 0).any()) {
+    return absl::InvalidArgumentError(absl::StrCat("tensor \"", tensor.name, "\" is not a covariance"));
+  }
+  *cov = values;
+  return absl::OkStatus();
 }
 
 /// The matrices of a prior by the names of their tensors.
@@ -282,6 +301,8 @@ std::string WriteAdaptedSubset(const Bundle& bundle, const nn::Mask& mask) {
     file.metadata[kAdaptedKey] = names.size() == mask.size() ? "*" : absl::StrJoin(names, ",");
   }
   if (bundle.posterior) file.tensors.push_back(TensorOf(*bundle.posterior));
+  file.tensors.push_back(TensorOf(kProcessNoiseName, bundle.noise.process));
+  file.tensors.push_back(TensorOf(kMeasurementNoiseName, bundle.noise.measurement));
   return WriteSafetensors(file);
 }
 
@@ -319,6 +340,10 @@ absl::Status ApplyAdaptedSubset(const std::string& bytes, Bundle* bundle) {
   for (const Safetensors::Tensor& tensor : file.tensors) {
     if (tensor.name == kPosteriorName || tensor.name == kCoordinatesName) {
       (tensor.name == kPosteriorName ? posterior : coordinates) = &tensor;
+      continue;
+    }
+    if (tensor.name == kProcessNoiseName || tensor.name == kMeasurementNoiseName) {
+      METAEKF_RETURN_IF_ERROR(StoreNoise(tensor, tensor.name == kProcessNoiseName ? &bundle->noise.process : &bundle->noise.measurement));
       continue;
     }
     METAEKF_RETURN_IF_ERROR(StoreTensor(tensor, bundle, &seen));

@@ -19,7 +19,8 @@ absl::StatusOr<Bundle> ReadModelFile(const std::string& bytes);
 
 /// The tensors of `mask` alone, as a .safetensors file: what an adaptation stores beside its base version. A posterior goes
 /// with them, as "posterior.information": the lower triangle, row by row. One of few coordinates says all by itself:
-/// "posterior.coordinates" stands for the tensors then, whose names are in the metadata.
+/// "posterior.coordinates" stands for the tensors then, whose names are in the metadata. Q and R of the adapted model are
+/// "noise.process" and "noise.measurement".
 std::string WriteAdaptedSubset(const Bundle& bundle, const nn::Mask& mask);
 
 /// Puts an adapted subset over the parameters of its base.

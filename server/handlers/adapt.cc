@@ -106,6 +106,7 @@ class AdaptCall final : public StreamHandler<Request, Response> {
     nssm::Bundle adapted = model_->bundle;
     adapted.parameters = std::move(result.parameters);
     adapted.posterior = std::move(result.posterior);
+    adapted.noise = std::move(result.noise);
     METAEKF_ASSIGN_OR_RETURN(
         store::StagedBlob file,
         context_.store.blobs().Stage(nssm::WriteAdaptedSubset(adapted, result.mask)));

@@ -1,3 +1,4 @@
+metaekf_test(core/filter/calibrate_test.cc DEPS metaekf::core_filter)
 metaekf_test(core/filter/chi_squared_test.cc DEPS metaekf::core_filter)
 metaekf_test(core/filter/constrain_test.cc DEPS metaekf::core_filter)
 metaekf_test(core/filter/ekf_test.cc DEPS metaekf::core_filter)

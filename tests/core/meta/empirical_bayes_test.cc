@@ -8,6 +8,7 @@
 #include <cmath>
 
 #include "core/data/split.h"
+#include "core/filter/ekf.h"
 #include "core/meta/adapt.h"
 #include "core/meta/arx.h"
 #include "core/meta/covariance_structure.h"
@@ -86,6 +87,32 @@ TEST(EmpiricalBayesTest, AFewSamplesOfANewSystemAreEnoughToSimulateIt) {
     EXPECT_GT(eigenvalues.minCoeff(), -1e-9 * eigenvalues.maxCoeff());
   }
   EXPECT_LT(adapted_errors, 0.1 * unadapted_errors);
+}
+
+TEST(EmpiricalBayesTest, FiltersOfNewSystemsHoldTheTruth) {
+  const nssm::Bundle bundle = *nssm::ReadModelFile(TrainedFile(2));
+  const std::shared_ptr<filter::FilterModel> model = filter::FilterModel::Create(bundle);
+  const auto scratch = model->MakeScratch();
+  int held = 0, all = 0;
+  double nis = 0;
+  for (uint64_t seed = 100; seed < 120; ++seed) {
+    MatrixXd clean;
+    Trajectory system = Resonator(400, kNoise, seed, &clean);
+    const AdaptationResult result = *Adapt(bundle, *data::FirstSamples(system, 100), *DefaultAdaptation(bundle), nullptr);
+    nssm::Bundle adapted = bundle;
+    adapted.noise = result.noise;
+    filter::Ekf ekf = *filter::Ekf::Create(adapted, model, model->Prepare(result.parameters), {});
+    filter::Estimate estimate = ekf.MakeEstimate();
+    for (Eigen::Index t = 100; t < 400; ++t) {
+      ASSERT_TRUE(ekf.Step(system.inputs.col(t), system.outputs.col(t), scratch.get(), &estimate).ok());
+      if (estimate.health == filter::Health::kWarmingUp || estimate.measured == 0) continue;
+      held += std::abs(estimate.mean[0] - clean(0, t)) <= 1.96 * std::sqrt(estimate.cov(0, 0)) ? 1 : 0;
+      nis += estimate.nis;
+      ++all;
+    }
+  }
+  EXPECT_NEAR(static_cast<double>(held) / all, 0.95, 0.03);
+  EXPECT_NEAR(nis / all, 1, 0.1);
 }
 
 TrainingSpec WithFactors(int32_t rank) {

@@ -68,10 +68,38 @@ TEST(ModelFileTest, APosteriorGoesWithTheAdaptedSubset) {
   ASSERT_TRUE(restored.posterior.has_value());
   EXPECT_EQ(restored.posterior->information, adapted.posterior->information);
   Safetensors file = *ReadSafetensors(subset);
-  file.tensors.back().values.push_back(1);
-  file.tensors.back().shape[0] += 1;
+  const auto posterior = std::find_if(file.tensors.begin(), file.tensors.end(), [](const Safetensors::Tensor& tensor) {
+    return tensor.name == "posterior.information";
+  });
+  ASSERT_NE(posterior, file.tensors.end());
+  posterior->values.push_back(1);
+  posterior->shape[0] += 1;
   const absl::Status refused = ApplyAdaptedSubset(WriteSafetensors(file), &restored);
   EXPECT_NE(std::string(refused.message()).find("posterior.information"), std::string::npos) << refused;
+}
+
+TEST(ModelFileTest, TheNoiseOfAnAdaptedModelGoesWithIt) {
+  const Bundle base = SomeBundle(ModelCases().front());
+  Bundle adapted = base;
+  adapted.noise.process *= 3;
+  adapted.noise.measurement *= 0.5;
+  const nn::Mask mask = *nn::ParseMask("output_decoder.0.bias", base.model.layout());
+  const std::string subset = WriteAdaptedSubset(adapted, mask);
+  Bundle restored = base;
+  ASSERT_TRUE(ApplyAdaptedSubset(subset, &restored).ok());
+  EXPECT_EQ(restored.noise.process, adapted.noise.process);
+  EXPECT_EQ(restored.noise.measurement, adapted.noise.measurement);
+  EXPECT_EQ(restored.noise.initial, base.noise.initial);
+  for (const auto& [damage, reason] : {std::pair{-1.0, "is not a covariance"}, std::pair{0.0, "is not 1 × 1"}}) {
+    Safetensors file = *ReadSafetensors(subset);
+    for (Safetensors::Tensor& tensor : file.tensors) {
+      if (tensor.name == "noise.process" && damage < 0) tensor.values[0] = damage;
+    }
+    Bundle other = base;
+    if (damage == 0) other.noise.process = Eigen::MatrixXd::Identity(1, 1);
+    const absl::Status refused = ApplyAdaptedSubset(WriteSafetensors(file), &other);
+    EXPECT_NE(std::string(refused.message()).find(reason), std::string::npos) << refused;
+  }
 }
 
 TEST(ModelFileTest, CoordinatesNeedTheDirectionsOfTheirBase) {

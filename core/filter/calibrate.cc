@@ -1,0 +1,131 @@
+#include "core/filter/calibrate.h"
+
+#include <Eigen/Cholesky>
+#include <cmath>
+#include <limits>
+#include <memory>
+#include <numbers>
+
+#include "core/filter/ekf.h"
+
+namespace metaekf::filter {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+constexpr double kFirstStep = 1.5, kLastStep = 0.1;  // of ln d²
+constexpr double kLargest = 30;                      // |ln d²|: 10¹³
+constexpr double kFailed = -std::numeric_limits<double>::infinity();
+
+/// Where a scale acts.
+struct Layout {
+  Index process = 0;      ///< entries of D_q: n, or 1 for all
+  Index measurement = 0;  ///< entries of D_r
+  Index size() const { return process + measurement; }
+};
+
+nssm::FilterNoise Scaled(const nssm::FilterNoise& noise, const VectorXd& log_scales, const Layout& layout) {
+  const Index n = noise.process.rows();
+  const VectorXd d = (0.5 * log_scales).array().exp();
+  const VectorXd d_q = layout.process == n ? VectorXd(d.head(n)) : VectorXd::Constant(n, d[0]);
+  const VectorXd d_r = d.tail(layout.measurement);
+  return {d_q.asDiagonal() * noise.process * d_q.asDiagonal(), d_r.asDiagonal() * noise.measurement * d_r.asDiagonal(), noise.initial};
+}
+
+double LogDensity(double error, double variance) { return -0.5 * (error * error / variance + std::log(2 * std::numbers::pi * variance)); }
+
+/// ln N(ỹ; 0, S) of what was measured, in units of the outputs' scales.
+double LogLikelihood(const Estimate& estimate, const VectorXd& scale) {
+  std::vector<Index> rows;
+  for (Index i = 0; i < scale.size(); ++i) {
+    if (!std::isnan(estimate.innovation[i])) rows.push_back(i);
+  }
+  const MatrixXd S = scale.cwiseInverse().asDiagonal() * estimate.innovation_cov * scale.cwiseInverse().asDiagonal();
+  const Eigen::LLT<MatrixXd> cholesky(MatrixXd(S(rows, rows)));
+  const double log_determinant = 2 * MatrixXd(cholesky.matrixL()).diagonal().array().log().sum();
+  return -0.5 * (estimate.nis + log_determinant + static_cast<double>(rows.size()) * std::log(2 * std::numbers::pi));
+}
+
+/// A recording and the filter's parameters for it.
+struct Prepared {
+  const data::Trajectory* trajectory = nullptr;
+  std::shared_ptr<const FilterModel::Parameters> parameters;
+};
+
+/// What the mean over samples is of; kFailed where the filter does not stay finite.
+double Score(const nssm::Bundle& bundle, const nssm::FilterNoise& noise, const std::shared_ptr<const FilterModel>& model,
+             const Prepared& run) {
+  const FilterOptions options{.process_cov = noise.process, .measurement_cov = noise.measurement, .initial_cov = noise.initial,
+                              .gate = {.probability = 0}, .restart_after_divergence = false};
+  absl::StatusOr<Ekf> ekf = Ekf::Create(bundle, model, run.parameters, options);
+  if (!ekf.ok()) return kFailed;
+  const auto scratch = model->MakeScratch();
+  Estimate estimate = ekf->MakeEstimate();
+  const bool states = !bundle.model.spec().is_case_one();
+  double sum = 0;
+  int64_t samples = 0;
+  for (Index t = 0; t < run.trajectory->length(); ++t) {
+    if (!ekf->Step(run.trajectory->inputs.col(t), run.trajectory->outputs.col(t), scratch.get(), &estimate).ok()) return kFailed;
+    if (estimate.health == Health::kWarmingUp || estimate.measured == 0) continue;
+    sum += LogLikelihood(estimate, bundle.normaliser.outputs.scale);
+    for (Index i = 0; states && i < estimate.mean.size(); ++i) {
+      const double scale = bundle.normaliser.states.scale[i];
+      sum += LogDensity((run.trajectory->states(i, t) - estimate.mean[i]) / scale, estimate.cov(i, i) / (scale * scale));
+    }
+    ++samples;
+  }
+  const double mean = sum / static_cast<double>(samples);
+  return std::isfinite(mean) ? mean : kFailed;
+}
+
+}  // namespace
+
+nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, double prior_std,
+                            base::Executor* executor) {
+  const std::shared_ptr<const FilterModel> model = FilterModel::Create(bundle);
+  std::vector<Prepared> prepared;
+  for (const CalibrationRun& run : runs) prepared.push_back({&run.trajectory, model->Prepare(run.parameters)});
+  const Layout layout{.process = bundle.model.spec().is_case_one() ? 1 : bundle.noise.process.rows(),
+                      .measurement = bundle.noise.measurement.rows()};
+  const auto objective = [&](const VectorXd& log_scales) {
+    if (log_scales.lpNorm<Eigen::Infinity>() > kLargest) return kFailed;
+    const nssm::FilterNoise noise = Scaled(bundle.noise, log_scales, layout);
+    std::vector<double> scores(prepared.size());
+    executor->ParallelFor(prepared.size(), [&](size_t i, size_t) { scores[i] = Score(bundle, noise, model, prepared[i]); });
+    double sum = 0;
+    for (const double score : scores) sum += score;
+    return sum / static_cast<double>(scores.size()) - 0.5 * log_scales.squaredNorm() / (prior_std * prior_std);
+  };
+
+  VectorXd best = VectorXd::Zero(layout.size());
+  double value = objective(best);
+  std::vector<VectorXd> directions;
+  directions.push_back(VectorXd::Zero(layout.size()));
+  directions.back().head(layout.process).setOnes();
+  directions.push_back(VectorXd::Zero(layout.size()));
+  directions.back().tail(layout.measurement).setOnes();
+  for (Index i = 0; i < layout.size(); ++i) {
+    // The only entry of its kind has had its turn.
+    if (i < layout.process ? layout.process > 1 : layout.measurement > 1) directions.push_back(VectorXd::Unit(layout.size(), i));
+  }
+  for (double step = kFirstStep; step >= kLastStep; step /= 2) {
+    for (bool better = true; better;) {
+      better = false;
+      for (const VectorXd& direction : directions) {
+        for (const double sign : {1.0, -1.0}) {
+          for (double trial; (trial = objective(best + sign * step * direction)) > value + 1e-6;) {
+            value = trial;
+            best += sign * step * direction;
+            better = true;
+          }
+        }
+      }
+    }
+  }
+  return Scaled(bundle.noise, best, layout);
+}
+
+}  // namespace metaekf::filter

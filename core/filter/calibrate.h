@@ -1,0 +1,35 @@
+#pragma once
+
+#include <vector>
+
+#include "core/base/executor.h"
+#include "core/data/trajectory.h"
+#include "core/filter/filter_model.h"
+
+namespace metaekf::filter {
+
+/// A recording of a system, with the parameters of the model that is to follow it.
+struct CalibrationRun {
+  std::vector<double> parameters;
+  data::Trajectory trajectory;  ///< physical units; Case II with states
+};
+
+/// Q and R with which filters explain recordings best.
+///
+/// A residual's second moment is the right Q only if model errors are white. Those of an adapted model are not: they last, and a
+/// filter that takes them for white noise believes itself too much. So Q and R are scaled, Q = D_q Q₀ D_q and R = D_r R₀ D_r with
+/// diagonal D, until the innovations of the filters are most likely,
+///
+///   max over D of  mean over runs of  1/T Σ_t [ ln N(ỹ_t; 0, S_t) + Σ_i ln N(x_{t,i}; x̂_{t,i}, P_{t,ii}) ] − Σ (ln d²)²/(2 s²),
+///
+/// the sum over states i in Case II, where they are recorded. In Case I, whose latents have no axes of their own, D_q is a multiple
+/// of the identity. By coordinate search in ln d², all of Q and all of R first, to a tenth.
+///
+/// @param bundle  with Q₀, R₀ and P₀ in its noise. @param runs  at least one, of systems that the parameters were not fitted to, or of
+///   samples that come after those. @param prior_std  s, of ln d²; infinite: no prior.
+/// @return the noise with Q and R scaled; as it was where no filter stays finite.
+/// Source: maximum likelihood of innovations, e.g. R. K. Mehra, IEEE Trans. Autom. Control 15 (1970) 175; the scaling is ours.
+nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, double prior_std,
+                            base::Executor* executor);
+
+}  // namespace metaekf::filter

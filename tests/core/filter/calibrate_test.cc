@@ -1,0 +1,97 @@
+#include "core/filter/calibrate.h"
+
+#include <gtest/gtest.h>
+
+#include "tests/core/filter/linear_filter.h"
+
+namespace metaekf::filter {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+constexpr double kNoPrior = std::numeric_limits<double>::infinity();
+
+std::vector<CalibrationRun> Runs(const nssm::Bundle& bundle, int count, Index steps) {
+  std::vector<CalibrationRun> runs;
+  for (int run = 0; run < count; ++run) {
+    LinearTruth truth(LinearSystem(), 100 + static_cast<uint64_t>(run));
+    data::Trajectory trajectory{.inputs = MatrixXd(1, steps), .outputs = MatrixXd(2, steps), .states = MatrixXd(2, steps)};
+    for (Index t = 0; t < steps; ++t) {
+      trajectory.states.col(t) = truth.state;
+      trajectory.outputs.col(t) = truth.Measure();
+      trajectory.inputs(0, t) = truth.rng.Normal();
+      truth.Advance(trajectory.inputs(0, t));
+    }
+    runs.push_back({bundle.parameters, std::move(trajectory)});
+  }
+  return runs;
+}
+
+TEST(CalibrateTest, FindsTheNoiseOfAKnownSystemFromWrongScales) {
+  nssm::Bundle bundle = LinearBundle(LinearSystem());
+  const nssm::FilterNoise truth = bundle.noise;
+  const Eigen::Vector2d wrong_q(0.1, 3), wrong_r(2, 0.2);  // factors of deviations
+  bundle.noise.process = wrong_q.asDiagonal() * truth.process * wrong_q.asDiagonal();
+  bundle.noise.measurement = wrong_r.asDiagonal() * truth.measurement * wrong_r.asDiagonal();
+  const auto executor = base::MakeThreadExecutor(2);
+  const nssm::FilterNoise found = Calibrate(bundle, Runs(bundle, 10, 400), kNoPrior, executor.get());
+  // 4,000 samples determine variances to a few per cent; the search ends at steps of a tenth in the logarithm.
+  for (Index i = 0; i < 2; ++i) {
+    EXPECT_NEAR(std::log(found.process(i, i) / truth.process(i, i)), 0, 0.25) << i;
+    EXPECT_NEAR(std::log(found.measurement(i, i) / truth.measurement(i, i)), 0, 0.25) << i;
+  }
+  EXPECT_EQ(found.initial, truth.initial);
+  // Correlations are not touched.
+  EXPECT_NEAR(found.process(0, 1) / std::sqrt(found.process(0, 0) * found.process(1, 1)),
+              truth.process(0, 1) / std::sqrt(truth.process(0, 0) * truth.process(1, 1)), 1e-12);
+}
+
+// A model with a wrong A: its one-step residuals are small, but they last. What is calibrated holds the truth, what the residuals say
+// does not.
+TEST(CalibrateTest, CountsThatErrorsOfAModelLast) {
+  LinearSystem wrong;
+  wrong.A(0, 0) = 0.97;
+  nssm::Bundle bundle = LinearBundle(wrong);
+  const auto share_held = [&](const nssm::FilterNoise& noise, const std::vector<CalibrationRun>& runs) {
+    bundle.noise = noise;
+    int held = 0, all = 0;
+    for (const CalibrationRun& run : runs) {
+      Filter filter(bundle);
+      for (Index t = 0; t < run.trajectory.length(); ++t) {
+        EXPECT_TRUE(filter.ekf.Step(run.trajectory.inputs.col(t), run.trajectory.outputs.col(t), filter.scratch.get(), &filter.estimate).ok());
+        for (Index i = 0; i < 2; ++i, ++all) {
+          held += std::abs(filter.estimate.mean[i] - run.trajectory.states(i, t)) <= 1.96 * std::sqrt(filter.estimate.cov(i, i)) ? 1 : 0;
+        }
+      }
+    }
+    return static_cast<double>(held) / all;
+  };
+  const std::vector<CalibrationRun> runs = Runs(bundle, 20, 300);
+  const std::vector<CalibrationRun> seen(runs.begin(), runs.begin() + 10), unseen(runs.begin() + 10, runs.end());
+  nssm::FilterNoise residual = LinearBundle(LinearSystem()).noise;
+  bundle.noise = residual;
+  const nssm::FilterNoise calibrated = Calibrate(bundle, seen, kNoPrior, base::CallingThread());
+  EXPECT_LT(share_held(residual, unseen), 0.93);
+  EXPECT_NEAR(share_held(calibrated, unseen), 0.95, 0.02);
+}
+
+TEST(CalibrateTest, AStrongPriorKeepsWhatIsThere) {
+  nssm::Bundle bundle = LinearBundle(LinearSystem());
+  bundle.noise.process *= 5;
+  const nssm::FilterNoise kept = Calibrate(bundle, Runs(bundle, 1, 100), 1e-3, base::CallingThread());
+  EXPECT_NEAR(kept.process(0, 0) / bundle.noise.process(0, 0), 1, 0.01);
+}
+
+TEST(CalibrateTest, AModelThatDivergesKeepsItsNoise) {
+  LinearSystem explosive;
+  explosive.A *= 1e9;
+  explosive.C.setZero();
+  const nssm::Bundle bundle = LinearBundle(explosive);
+  const nssm::FilterNoise kept = Calibrate(bundle, Runs(bundle, 1, 200), kNoPrior, base::CallingThread());
+  EXPECT_EQ(kept.process, bundle.noise.process);
+}
+
+}  // namespace
+}  // namespace metaekf::filter
