@@ -202,7 +202,8 @@ SessionInfo FromProto(const v1::SessionOpened& message) {
 }
 
 EstimateBatch FromProto(const v1::EstimateBatch& message) {
-  EstimateBatch batch{.first_seq = message.first_seq(),
+  EstimateBatch batch{.forecast = false,
+                      .first_seq = message.first_seq(),
                       .durable_seq = message.durable_seq(),
                       .samples = static_cast<size_t>(message.nis_size()),
                       .times_s = ToVector(message.times_s()),

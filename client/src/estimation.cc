@@ -150,6 +150,15 @@ Result<uint64_t> EstimationSession::Send(const SampleBatch& samples) {
   return last;
 }
 
+Status EstimationSession::AskForecast(size_t horizon, const std::vector<double>& inputs) {
+  impl_->Join();
+  v1::EstimateRequest request;
+  request.mutable_forecast()->set_horizon(static_cast<uint32_t>(horizon));
+  request.mutable_forecast()->mutable_inputs()->Add(inputs.begin(), inputs.end());
+  if (!impl_->stream->Write(request)) return Error(Code::kUnavailable, "the stream has ended");
+  return {};
+}
+
 void EstimationSession::FinishSending() {
   impl_->Join();
   impl_->stream->WritesDone();
@@ -166,6 +175,11 @@ Result<std::optional<EstimateBatch>> EstimationSession::Receive() {
     impl_->changed.notify_all();
     METAEKF_CLIENT_RETURN_IF_ERROR(impl_->client->Translate(impl_->stream->Finish()));
     return std::optional<EstimateBatch>();
+  }
+  if (response.has_forecast()) {
+    EstimateBatch forecast = FromProto(response.forecast());
+    forecast.forecast = true;
+    return std::optional<EstimateBatch>(std::move(forecast));
   }
   EstimateBatch batch = FromProto(response.estimates());
   {

@@ -6,6 +6,7 @@
 #include <memory>
 #include <numbers>
 
+#include "core/base/status.h"
 #include "core/filter/ekf.h"
 
 namespace metaekf::filter {
@@ -49,27 +50,49 @@ double LogLikelihood(const Estimate& estimate, const VectorXd& scale) {
   return -0.5 * (estimate.nis + log_determinant + static_cast<double>(rows.size()) * std::log(2 * std::numbers::pi));
 }
 
-/// A recording and the filter's parameters for it.
+/// A recording, the filter's parameters for it, and where it stands when its first window is full, whatever Q and R.
 struct Prepared {
   const data::Trajectory* trajectory = nullptr;
   std::shared_ptr<const FilterModel::Parameters> parameters;
+  FilterState start;
+  Index begin = 0;
 };
+
+absl::StatusOr<Ekf> MakeFilter(const nssm::Bundle& bundle, const nssm::FilterNoise& noise,
+                               const std::shared_ptr<const FilterModel>& model, const Prepared& run) {
+  return Ekf::Create(bundle, model, run.parameters,
+                     {.process_cov = noise.process, .measurement_cov = noise.measurement, .initial_cov = noise.initial,
+                      .gate = {.probability = 0}, .restart_after_divergence = false});
+}
+
+/// Errors: those of Ekf; a recording in which no window is full begins at its end.
+absl::Status WarmUp(const nssm::Bundle& bundle, const std::shared_ptr<const FilterModel>& model, Prepared* run) {
+  METAEKF_ASSIGN_OR_RETURN(Ekf ekf, MakeFilter(bundle, bundle.noise, model, *run));
+  const auto scratch = model->MakeScratch();
+  Estimate estimate = ekf.MakeEstimate();
+  estimate.health = bundle.model.spec().is_case_one() ? Health::kWarmingUp : Health::kConsistent;
+  for (; estimate.health == Health::kWarmingUp && run->begin < run->trajectory->length(); ++run->begin) {
+    METAEKF_RETURN_IF_ERROR(ekf.Step(run->trajectory->inputs.col(run->begin), run->trajectory->outputs.col(run->begin),
+                                     scratch.get(), &estimate));
+  }
+  run->start = ekf.state();
+  return absl::OkStatus();
+}
 
 /// What the mean over samples is of; kFailed where the filter does not stay finite.
 double Score(const nssm::Bundle& bundle, const nssm::FilterNoise& noise, const std::shared_ptr<const FilterModel>& model,
              const Prepared& run) {
-  const FilterOptions options{.process_cov = noise.process, .measurement_cov = noise.measurement, .initial_cov = noise.initial,
-                              .gate = {.probability = 0}, .restart_after_divergence = false};
-  absl::StatusOr<Ekf> ekf = Ekf::Create(bundle, model, run.parameters, options);
+  absl::StatusOr<Ekf> ekf = MakeFilter(bundle, noise, model, run);
   if (!ekf.ok()) return kFailed;
+  ekf->Restore(run.start);
   const auto scratch = model->MakeScratch();
   Estimate estimate = ekf->MakeEstimate();
   const bool states = !bundle.model.spec().is_case_one();
   double sum = 0;
   int64_t samples = 0;
-  for (Index t = 0; t < run.trajectory->length(); ++t) {
+  for (Index t = run.begin; t < run.trajectory->length(); ++t) {
     if (!ekf->Step(run.trajectory->inputs.col(t), run.trajectory->outputs.col(t), scratch.get(), &estimate).ok()) return kFailed;
-    if (estimate.health == Health::kWarmingUp || estimate.measured == 0) continue;
+    if (estimate.measured == 0) continue;
     sum += LogLikelihood(estimate, bundle.normaliser.outputs.scale);
     for (Index i = 0; states && i < estimate.mean.size(); ++i) {
       const double scale = bundle.normaliser.states.scale[i];
@@ -87,7 +110,10 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
                             base::Executor* executor) {
   const std::shared_ptr<const FilterModel> model = FilterModel::Create(bundle);
   std::vector<Prepared> prepared;
-  for (const CalibrationRun& run : runs) prepared.push_back({&run.trajectory, model->Prepare(run.parameters)});
+  for (const CalibrationRun& run : runs) {
+    prepared.push_back({&run.trajectory, model->Prepare(run.parameters), {}});
+    if (!WarmUp(bundle, model, &prepared.back()).ok()) return bundle.noise;
+  }
   const Layout layout{.process = bundle.model.spec().is_case_one() ? 1 : bundle.noise.process.rows(),
                       .measurement = bundle.noise.measurement.rows()};
   const auto objective = [&](const VectorXd& log_scales) {

@@ -152,7 +152,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
     bool accepted = true;
     if (live_ == nullptr) {
       accepted = service_.io_.Submit([this] { Work([this] { return OpenOrResume(); }); });
-    } else if (work_.samples().outputs_size() * time_per_value_ > kLongReaction) {
+    } else if (ValuesOf(work_) * time_per_value_ > kLongReaction) {
       accepted = service_.heavy_.Submit([this] { Work([this] { return Apply(); }); });
     } else {
       // The batch is short: applied in this reaction, but without the mutex, which the caller holds.
@@ -205,6 +205,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
       opened->set_token((*live)->token);
       opened->set_epoch((*live)->epoch);
       opened->set_durable_seq((*live)->durable_seq);
+      output_size_ = opened->output_size();
       // A batch of the largest models takes about 20 ns per parameter and output; measured from the first batch on.
       time_per_value_ = std::chrono::nanoseconds(
           static_cast<int64_t>((*live)->session->model().bundle.parameters.size()));
@@ -214,9 +215,14 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
     return absl::OkStatus();
   }
 
+  /// Outputs that are estimated, which is what work takes time for.
+  int64_t ValuesOf(const v1::EstimateRequest& work) const {
+    return work.has_forecast() ? int64_t{work.forecast().horizon()} * output_size_ : work.samples().outputs_size();
+  }
+
   absl::Status Apply() {
-    if (work_.kind_case() != v1::EstimateRequest::kSamples) {
-      return FieldViolation("kind", "the session is open: send samples");
+    if (!work_.has_samples() && !work_.has_forecast()) {
+      return FieldViolation("kind", "the session is open: send samples or ask for a forecast");
     }
     response_.Clear();
     const steady_clock::time_point start = steady_clock::now();
@@ -227,6 +233,10 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
       std::lock_guard session_lock(live_->mutex);
       if (live_->taken_over) {
         status = TakenOver();
+      } else if (work_.has_forecast()) {
+        v1::EstimateBatch* forecast = response_.mutable_forecast();
+        status = live_->session->Forecast(work_.forecast(), scratch.get(), forecast);
+        forecast->set_durable_seq(live_->durable_seq);
       } else {
         v1::EstimateBatch* estimates = response_.mutable_estimates();
         status = live_->session->Apply(work_.samples(), scratch.get(), estimates);
@@ -237,7 +247,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
     }
     live_->scratch->GiveBack(std::move(scratch));
     if (applied) service_.sessions_.MarkDirty(live_);
-    const int values = work_.samples().outputs_size();
+    const int64_t values = ValuesOf(work_);
     if (values > 0) time_per_value_ = (steady_clock::now() - start) / values;
     return status;
   }
@@ -248,6 +258,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   v1::EstimateRequest work_;       // being worked on
   v1::EstimateResponse response_;  // being made or written
   std::shared_ptr<LiveSession> live_;
+  int64_t output_size_ = 0;
   steady_clock::duration time_per_value_{};  // of outputs in a batch, as last measured
 
   std::mutex mutex_;

@@ -27,6 +27,7 @@ using v1::OpenSession;
 constexpr double kTimeTolerance = 0.1;     // periods that a time may be off the grid
 constexpr int64_t kMaxMissedPeriods = 100'000;
 constexpr int64_t kMaxLag = 1000;              // periods
+constexpr int64_t kMaxHorizon = 10'000;        // samples
 constexpr int64_t kMaxRemembered = 64 << 20;   // bytes
 
 /// Periods that a measurement may come late. Errors: InvalidArgument for a lag that is negative or too long to remember.
@@ -232,6 +233,26 @@ absl::Status Session::ApplyRow(const v1::SampleBatch& batch, int64_t row, filter
   uint32_t flags = missing ? EstimateBatch::MISSING : EstimateBatch::NO_FLAG;
   if (periods < 1) flags |= EstimateBatch::DELAYED;
   WriteEstimate(format_, time, estimate_, flags, estimates);
+  return absl::OkStatus();
+}
+
+absl::Status Session::Forecast(const v1::ForecastRequest& request, filter::FilterModel::Scratch* scratch,
+                               EstimateBatch* forecast) const {
+  const int64_t n_u = filter_.ekf().input_size(), horizon = request.horizon();
+  if (horizon < 1 || horizon > kMaxHorizon) {
+    return FieldViolation("forecast.horizon", absl::StrCat("must be from 1 to ", kMaxHorizon, ", got ", horizon));
+  }
+  if (request.inputs_size() != 0 && request.inputs_size() != horizon * n_u) {
+    return FieldViolation("forecast.inputs", absl::StrCat("expected ", horizon, " × ", n_u, " values or none, got ", request.inputs_size()));
+  }
+  MatrixXd inputs = filter_.ekf().LastInput().replicate(1, horizon);
+  if (request.inputs_size() != 0) inputs = Eigen::Map<const MatrixXd>(request.inputs().data(), n_u, horizon);
+  const auto estimates = filter_.ekf().Forecast(inputs, scratch);
+  if (!estimates.ok()) return FieldViolation("forecast.inputs", std::string(estimates.status().message()));
+  forecast->set_first_seq(seq_ + 1);
+  for (size_t k = 0; k < estimates->size(); ++k) {
+    WriteEstimate(format_, time_s_ + static_cast<double>(k + 1) * period_s_, (*estimates)[k], EstimateBatch::MISSING, forecast);
+  }
   return absl::OkStatus();
 }
 

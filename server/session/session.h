@@ -25,6 +25,10 @@ class Session {
   /// session is unchanged then.
   absl::Status Apply(const v1::SampleBatch& batch, filter::FilterModel::Scratch* scratch, v1::EstimateBatch* estimates);
 
+  /// Writes what the samples after the newest will be like. Errors: InvalidArgument with violations below `forecast`.
+  absl::Status Forecast(const v1::ForecastRequest& request, filter::FilterModel::Scratch* scratch,
+                        v1::EstimateBatch* forecast) const;
+
   /// Everything that changes, as bytes with a checksum; and back.
   std::string Checkpoint() const;
   /// Errors: those of DecodeCheckpoint.

@@ -315,6 +315,15 @@ class EstimationService : public v1::EstimationService::Service {
     }
     stream->Write(Opened(request.has_open()));
     while (stream->Read(&request)) {
+      if (request.has_forecast()) {
+        v1::EstimateResponse response;
+        for (uint32_t i = 0; i < request.forecast().horizon(); ++i) {
+          response.mutable_forecast()->add_means(fake_.last_mean);
+          response.mutable_forecast()->add_nis(kNaN);
+        }
+        stream->Write(response);
+        continue;
+      }
       fake_.batches.push_back(request.samples());
       stream->Write(Answer(request.samples()));
       if (fake_.stop_after_batches > 0 && --fake_.stop_after_batches == 0) {

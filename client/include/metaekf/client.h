@@ -308,6 +308,7 @@ enum Flag : uint32_t {
 
 /// Posteriors of consecutive samples, flattened row by row; NaN while warming up.
 struct EstimateBatch {
+  bool forecast = false;   ///< answers AskForecast: of samples that are still to come
   uint64_t first_seq = 0;  ///< the sample that the first row answers
   uint64_t durable_seq = 0;
   size_t samples = 0;
@@ -442,6 +443,10 @@ class EstimationSession {
   /// Errors: InvalidArgument for sizes that do not fit; Unavailable once the stream has ended
   /// (Receive says why).
   Result<uint64_t> Send(const SampleBatch& samples);
+  /// Asks what the next `horizon` samples will be like; the answer comes by Receive, after those to
+  /// what has been sent before. Lost with the stream: ask again after Resume.
+  /// @param inputs  horizon × n_u; empty: the last input goes on.
+  Status AskForecast(size_t horizon, const std::vector<double>& inputs = {});
   /// Says that nothing more will be sent.
   void FinishSending();
 

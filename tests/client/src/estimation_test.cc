@@ -53,6 +53,20 @@ TEST_F(EstimationTest, SendsAndReceivesInOneThread) {
   EXPECT_FALSE(end->has_value());
 }
 
+TEST_F(EstimationTest, ForecastsComeInTheirTurn) {
+  const auto session = Open();
+  ASSERT_TRUE(session->Send(Batch({1, 2})).ok());
+  ASSERT_TRUE(session->AskForecast(3).ok());
+  ASSERT_TRUE(session->Send(Batch({5})).ok());
+  const auto first = session->Receive(), forecast = session->Receive(), last = session->Receive();
+  ASSERT_TRUE(first.ok() && forecast.ok() && last.ok());
+  EXPECT_FALSE((*first)->forecast);
+  EXPECT_TRUE((*forecast)->forecast);
+  EXPECT_THAT((*forecast)->means, ElementsAre(2, 2, 2));
+  EXPECT_THAT((*last)->means, ElementsAre(5));
+  EXPECT_EQ((*last)->first_seq, 3U);
+}
+
 TEST_F(EstimationTest, SendingWaitsForAnswersBeyondTheLimit) {
   const auto session = Open({.max_in_flight = 4});
   std::thread sender([&] {

@@ -397,6 +397,36 @@ TEST_F(EstimationServiceTest, SamplesMayBringTheirOwnNoise) {
   EXPECT_NE(call.stream->Finish().error_message().find("samples.measurement_noise_covs"), std::string::npos);
 }
 
+TEST_F(EstimationServiceTest, ForecastsAreWhatPassesWithoutMeasurements) {
+  Recording recording = MakeRecording(30, 0);
+  Call call = Start(OpenRequest());
+  ReadOpened(call);
+  Run(call, recording, 1, 20, 20);
+  v1::EstimateRequest request;
+  request.mutable_forecast()->set_horizon(10);
+  for (size_t t = 20; t < 30; ++t) request.mutable_forecast()->add_inputs(recording.inputs[t]);
+  call.stream->Write(request);
+  v1::EstimateResponse response;
+  ASSERT_TRUE(call.stream->Read(&response)) << call.stream->Finish().error_message();
+  ASSERT_TRUE(response.has_forecast());
+  EXPECT_EQ(response.forecast().first_seq(), 21u);
+  Estimates forecast;
+  Append(response.forecast(), &forecast);
+  // The session goes on as if nothing had been asked.
+  for (size_t t = 20; t < 30; ++t) recording.outputs[t] = kNaN;
+  ExpectIdentical(Run(call, recording, 21, 30, 10), forecast);
+
+  request.mutable_forecast()->clear_inputs();
+  request.mutable_forecast()->set_horizon(3);
+  call.stream->Write(request);
+  ASSERT_TRUE(call.stream->Read(&response));
+  EXPECT_EQ(response.forecast().nis_size(), 3);
+  request.mutable_forecast()->set_horizon(0);
+  call.stream->Write(request);
+  EXPECT_FALSE(call.stream->Read(&response));
+  EXPECT_NE(call.stream->Finish().error_message().find("forecast.horizon"), std::string::npos);
+}
+
 TEST_F(EstimationServiceTest, WhatCannotBeOpenedIsRefused) {
   const auto status_of = [&](const v1::EstimateRequest& first) {
     Call call = Start(first);
