@@ -28,6 +28,7 @@ struct Flags {
   bool stay_diverged = false;
   double max_lag_s = 0;
   bool smooth = false;
+  std::string projection = "qp";
 };
 
 /// What is kept of the estimates for the plot.
@@ -158,6 +159,11 @@ client::GateSettings Gate(const Flags& flags) {
   return {.probability = std::max(0.0, flags.gate), .recover_after = flags.recover_after, .off = flags.gate == 0};
 }
 
+client::Projection ProjectionOf(const Flags& flags) {
+  if (flags.projection == "autoencoder") return client::Projection::kAutoencoder;
+  return flags.projection == "none" ? client::Projection::kNone : client::Projection::kQuadraticProgram;
+}
+
 /// All rows of a file at once, each estimated from all of them.
 absl::Status EstimateSmoothly(const Flags& flags, Console& console) {
   if (flags.data == "-") return UsageError("--smooth needs the whole recording: give it as --data FILE");
@@ -177,7 +183,7 @@ absl::Status EstimateSmoothly(const Flags& flags, Console& console) {
     rows.states.emplace_back(trajectory.states.col(t));
   }
   trajectory.states.resize(0, trajectory.length());  // not what is estimated from
-  client::SmoothingRequest request{.target = flags.target, .gate = Gate(flags), .trajectory = ToClient(trajectory)};
+  client::SmoothingRequest request{.target = flags.target, .gate = Gate(flags), .projection = ProjectionOf(flags), .trajectory = ToClient(trajectory)};
   METAEKF_ASSIGN_OR_RETURN(request.noise, ReadNoise(flags));
   METAEKF_ASSIGN_OR_RETURN(const client::Smoothed smoothed, ToAbsl(console.client().Smooth(request)));
 
@@ -210,6 +216,7 @@ absl::Status Estimate(const Flags& flags, Console& console) {
                                     .sample_period_s = flags.columns.sample_period_s,
                                     .max_lag_s = flags.max_lag_s,
                                     .gate = Gate(flags),
+                                    .projection = ProjectionOf(flags),
                                     .stay_diverged = flags.stay_diverged,
                                     .max_in_flight = kMaxInFlight};
   METAEKF_ASSIGN_OR_RETURN(options.noise, ReadNoise(flags));
@@ -267,6 +274,10 @@ void AddEstimate(CLI::App& app, Console& console, Command& chosen) {
   command->add_option("--recover-after", flags->recover_after,
                       "Samples with outliers in a row after which they are believed (default 5)")
       ->check(CLI::PositiveNumber);
+  command->add_option("--projection", flags->projection,
+                      "How estimates of a constrained model are put inside: qp (the most probable point, default), "
+                      "autoencoder, or none")
+      ->check(CLI::IsMember({"qp", "autoencoder", "none"}));
   command->add_flag("--stay-diverged", flags->stay_diverged, "Do not begin anew after a divergence");
   command->add_option("--max-lag-s", flags->max_lag_s,
                       "How late a measurement may be: rows with an earlier t than the latest are applied at their own time")

@@ -49,12 +49,17 @@ physics::Polyhedron InUnits(const physics::Polyhedron& set, const VectorXd& mean
   return normalised;
 }
 
-ConstraintEffect Constrain(const physics::Polyhedron& set, VectorXd* mean, MatrixXd* factor) {
-  ConstraintEffect effect{.slack = std::numeric_limits<double>::infinity()};
+double Slack(const physics::Polyhedron& set, const VectorXd& x) {
+  double slack = std::numeric_limits<double>::infinity();
   for (Index i = 0; i < set.g.size(); ++i) {
     const double length = set.G.row(i).norm();
-    if (length > 0) effect.slack = std::min(effect.slack, (set.g[i] - set.G.row(i).dot(*mean)) / length);
+    if (length > 0) slack = std::min(slack, (set.g[i] - set.G.row(i).dot(x)) / length);
   }
+  return slack;
+}
+
+ConstraintEffect Constrain(const physics::Polyhedron& set, VectorXd* mean, MatrixXd* factor) {
+  ConstraintEffect effect{.slack = Slack(set, *mean)};
   if (physics::Contains(set, *mean)) return effect;
   const VectorXd outside = set.G * *mean - set.g;
   const physics::Projection projection = physics::Project(set, *mean, *factor * factor->transpose());

@@ -8,7 +8,7 @@ namespace metaekf::filter {
 
 /// What a constraint has done to an estimate, in the units of the state.
 struct ConstraintEffect {
-  double slack = 0;       ///< distance to the nearest plane before, negative outside: min_i (g_i − G_i x)/|G_i|
+  double slack = 0;       ///< before, see Slack
   double projection = 0;  ///< how far the mean was moved; 0 where it was inside
 };
 
@@ -28,6 +28,9 @@ struct ConstraintEffect {
 /// Allocates only where the mean is outside.
 /// Source: the projection is paper.tex's alternative to eq. ae_based_proj; the covariance is ours.
 ConstraintEffect Constrain(const physics::Polyhedron& set, Eigen::VectorXd* mean, Eigen::MatrixXd* factor);
+
+/// The distance to the nearest plane, negative outside: min_i (g_i − G_i x)/|G_i|; infinite without one.
+double Slack(const physics::Polyhedron& set, const Eigen::VectorXd& x);
 
 /// ρ(α), α ≥ 0.
 double EdgeVariance(double alpha);

@@ -114,6 +114,7 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
   }
   ekf.recover_after_ = options.gate.recover_after;
   ekf.restart_after_divergence_ = options.restart_after_divergence;
+  ekf.projection_ = options.projection;
   ekf.state_.mean = ekf.initial_mean_;
   ekf.state_.factor = ekf.initial_factor_;
   ekf.state_.last_input = VectorXd::Zero(ekf.input_size_);
@@ -178,12 +179,7 @@ absl::Status Ekf::Step(const Ref<const VectorXd>& input, const Ref<const VectorX
   ++state_.samples;
   state_.last_input = u_;
   MeasurementUpdate(R ? *R : measurement_cov_, scratch, estimate);
-  estimate->slack = estimate->projection = kNaN;
-  if (normalised_set_ && state_.mean.allFinite() && state_.factor.allFinite()) {
-    const ConstraintEffect effect = Constrain(*normalised_set_, &state_.mean, &state_.factor);
-    estimate->slack = effect.slack;
-    estimate->projection = effect.projection;
-  }
+  PutInside(scratch, estimate);
   if (warming_up()) {
     estimate->mean.setConstant(kNaN);
     estimate->cov.setConstant(kNaN);
@@ -355,11 +351,30 @@ void Ekf::Describe(const VectorXd& mean, const MatrixXd& factor, const VectorXd&
     estimate->mean = mean.cwiseProduct(scaling.scale) + scaling.mean;
     root = factor;
   }
-  if (set_ && estimate->mean.allFinite() && !physics::Contains(*set_, estimate->mean)) {
+  if (set_ && projection_ != Projection::kNone && estimate->mean.allFinite() && !physics::Contains(*set_, estimate->mean)) {
     estimate->mean = physics::Inside(*set_, estimate->mean);  // rounding has put it outside
   }
   for (Index i = 0; i < root.rows(); ++i) root.row(i) *= scaling.scale[i];
   estimate->cov.noalias() = root.lazyProduct(root.transpose());
+}
+
+void Ekf::PutInside(FilterModel::Scratch* scratch, Estimate* estimate) {
+  estimate->slack = estimate->projection = kNaN;
+  if (!normalised_set_ || !state_.mean.allFinite() || !state_.factor.allFinite()) return;
+  if (projection_ == Projection::kQuadraticProgram) {
+    const ConstraintEffect effect = Constrain(*normalised_set_, &state_.mean, &state_.factor);
+    estimate->slack = effect.slack;
+    estimate->projection = effect.projection;
+    return;
+  }
+  estimate->slack = Slack(*normalised_set_, state_.mean);
+  estimate->projection = 0;
+  if (projection_ == Projection::kNone || physics::Contains(*normalised_set_, state_.mean)) return;
+  model_->Reconstruct(*parameters_, state_.mean, u_, &value_, &F_, scratch);
+  estimate->projection = (value_ - state_.mean).norm();
+  state_.mean = value_;
+  state_.factor = F_ * state_.factor;
+  LowerTriangularise(state_.factor);
 }
 
 void Ekf::JudgeHealth(Estimate* estimate) {

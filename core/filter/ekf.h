@@ -27,6 +27,13 @@ struct Estimate {
   Health health = Health::kWarmingUp;
 };
 
+/// How an estimate is put inside the set that the states lie in.
+enum class Projection {
+  kQuadraticProgram,  ///< the most probable point of the set, and the error about it (Constrain)
+  kAutoencoder,       ///< x⁺ ← 𝓟x𝓓x𝓔(x⁺, u), P⁺ ← J P⁺ Jᵀ with J its Jacobian, where x⁺ is outside (eq. ae_based_proj)
+  kNone,              ///< it may stay outside
+};
+
 /// Settings of a filter that override those of the model's file. Physical units (latents in Case I).
 struct FilterOptions {
   std::optional<Eigen::MatrixXd> process_cov;      ///< Q, n × n, positive semidefinite
@@ -34,6 +41,7 @@ struct FilterOptions {
   std::optional<Eigen::VectorXd> initial_mean;     ///< Case II: x⁻ at the first sample; default the fleet's mean
   std::optional<Eigen::MatrixXd> initial_cov;      ///< n × n, positive semidefinite
   GateOptions gate;
+  Projection projection = Projection::kQuadraticProgram;
   bool restart_after_divergence = true;  ///< begin anew, from the initial condition, with the sample after one that diverged
 };
 
@@ -66,7 +74,7 @@ struct StepTrace {
 ///   ỹ = y − h(x⁻, u_t)       S = H P⁻ Hᵀ + R
 ///   x⁺ = x⁻ + K ỹ            P⁺ = (I − K H) P⁻           K = P⁻ Hᵀ S⁻¹
 ///
-/// in square-root form. Where the model's states lie in a set, the estimate is put inside (Constrain), and the mean that is
+/// in square-root form. Where the model's states lie in a set, the estimate is put inside (Projection), and the mean that is
 /// given out is inside to rounding in physical units. Components of y that are NaN are not measured; if all are, only time
 /// passes. In Case I the state is the latent ψ; the first H fully measured samples in a row fill the encoder's window, the
 /// last of them gives the first estimate.
@@ -116,6 +124,7 @@ class Ekf {
 
   int32_t estimate_size() const { return case_one_ ? output_size_ : state_size_; }
   const Eigen::MatrixXd& process_factor() const { return process_factor_; }
+  bool projects() const { return projection_ != Projection::kNone; }
   /// The set of the state in normalised units; null without one.
   const physics::Polyhedron* normalised_set() const { return normalised_set_ ? &*normalised_set_ : nullptr; }
   int32_t input_size() const { return input_size_; }
@@ -135,6 +144,7 @@ class Ekf {
   void WriteInnovation(Estimate* estimate) const;
   void LeaveOutliersOut(const Eigen::MatrixXd& R, Estimate* estimate);
   void Restart();
+  void PutInside(FilterModel::Scratch* scratch, Estimate* estimate);
   void JudgeHealth(Estimate* estimate);
   bool warming_up() const { return case_one_ && state_.window.size() < window_size_; }
 
@@ -154,6 +164,7 @@ class Ekf {
   std::vector<double> gate_limits_;   // on the NIS of 1 … n_y components; empty: no gate
   int64_t recover_after_ = 0;
   bool restart_after_divergence_ = true;
+  Projection projection_ = Projection::kQuadraticProgram;
 
   FilterState state_;
   StepTrace* trace_ = nullptr;

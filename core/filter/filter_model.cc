@@ -19,7 +19,7 @@ using Eigen::VectorXd;
 enum Slot : int32_t { kParameters, kState, kInput, kValueOut, kJacobianOut };
 
 struct Programs {
-  autodiff::Program transition, measurement, encode;
+  autodiff::Program transition, measurement, reconstruction, encode;
 };
 
 /// value(x, u) and its derivative along every component of x at once.
@@ -52,6 +52,11 @@ Programs BuildPrograms(const nssm::Model& model, int32_t n) {
                                             : parts.Output(parts.Encode(state, input), state);
     return WithJacobian(graph, output, state);
   });
+  if (!spec.is_case_one()) {
+    programs.reconstruction = with_graph([&](Graph* graph, const nssm::ModelGraph& parts, Value state, Value input) {
+      return WithJacobian(graph, parts.State(parts.Encode(state, input)), state);
+    });
+  }
   if (spec.is_case_one() && !spec.fits_start()) {
     Graph graph;
     const nssm::ModelGraph parts(&model, &graph, nn::BindParameters(model.layout(), kParameters, &graph));
@@ -68,6 +73,7 @@ class TypedFilterModel : public FilterModel {
       : model_(bundle.model),
         transition_(std::move(programs.transition)),
         measurement_(std::move(programs.measurement)),
+        reconstruction_(std::move(programs.reconstruction)),
         encode_(std::move(programs.encode)),
         argument_size_(std::max<int64_t>(state_size, model_.start_size())),
         input_size_(model_.spec().input_size),
@@ -95,6 +101,11 @@ class TypedFilterModel : public FilterModel {
     Run(measurement_, parameters, x, u, h, H, scratch);
   }
 
+  void Reconstruct(const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u,
+                   VectorXd* reconstruction, MatrixXd* J, Scratch* scratch) const override {
+    Run(reconstruction_, parameters, x, u, reconstruction, J, scratch);
+  }
+
   void Encode(const Parameters& parameters, const Eigen::Ref<const VectorXd>& window, VectorXd* latent, Scratch* scratch) const override {
     if (!prior_) return Run(encode_, parameters, window, VectorXd(), latent, nullptr, scratch);
     TypedScratch& s = static_cast<TypedScratch&>(*scratch);
@@ -113,7 +124,7 @@ class TypedFilterModel : public FilterModel {
   };
   struct TypedScratch : Scratch {
     explicit TypedScratch(const TypedFilterModel& owner)
-        : arena({&owner.transition_, &owner.measurement_, &owner.encode_}),
+        : arena({&owner.transition_, &owner.measurement_, &owner.reconstruction_, &owner.encode_}),
           state(static_cast<size_t>(owner.argument_size_)),
           input(static_cast<size_t>(owner.input_size_)),
           value(static_cast<size_t>(owner.value_size_)),
@@ -149,7 +160,7 @@ class TypedFilterModel : public FilterModel {
 
   const nssm::Model model_;
   std::optional<nssm::GaussianPrior> prior_;
-  Executable<T> transition_, measurement_, encode_;
+  Executable<T> transition_, measurement_, reconstruction_, encode_;
   int64_t argument_size_;
   int32_t input_size_, value_size_;
 };

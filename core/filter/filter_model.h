@@ -42,6 +42,9 @@ class FilterModel {
   /// h and H = ∂h/∂x at (x, u). @param H  n_y × n.
   virtual void Measurement(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
                            Eigen::VectorXd* h, Eigen::MatrixXd* H, Scratch* scratch) const = 0;
+  /// Case II: the autoencoder's x̄ = 𝓟x𝓓x𝓔(x, u) and ∂x̄/∂x. @param J  n × n.
+  virtual void Reconstruct(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
+                           Eigen::VectorXd* reconstruction, Eigen::MatrixXd* J, Scratch* scratch) const = 0;
   /// Case I: ψ = 𝓔(window), samples oldest first, each [u; y]; StartFit where the start is fitted.
   virtual void Encode(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& window, Eigen::VectorXd* latent,
                       Scratch* scratch) const = 0;

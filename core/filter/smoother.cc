@@ -69,7 +69,7 @@ absl::StatusOr<std::vector<Estimate>> Smooth(Ekf filter, const data::Trajectory&
     if (!now.usable() || !later.usable() || !later.trace.linked) continue;
     StepBack(later.trace, filter.process_factor(), later, &now);
     const physics::Polyhedron* const set = filter.normalised_set();
-    if (set != nullptr && now.usable()) {
+    if (set != nullptr && filter.projects() && now.usable()) {
       const ConstraintEffect effect = Constrain(*set, &now.mean, &now.factor);
       estimates[t].slack = effect.slack;
       estimates[t].projection = effect.projection;

@@ -47,6 +47,17 @@ absl::Status ReadGate(const std::string& field, const v1::GateSettings& gate, fi
   return absl::OkStatus();
 }
 
+filter::Projection ToProjection(v1::Projection projection) {
+  switch (projection) {
+    case v1::AUTOENCODER:
+      return filter::Projection::kAutoencoder;
+    case v1::NO_PROJECTION:
+      return filter::Projection::kNone;
+    default:
+      return filter::Projection::kQuadraticProgram;
+  }
+}
+
 absl::StatusOr<MatrixXd> ReadCovariance(const std::string& field, const double* values, Index count, Index n) {
   MatrixXd cov = MatrixXd::Zero(n, n);
   if (count != n && count != n * (n + 1) / 2) {

@@ -13,12 +13,15 @@ absl::Status ReadNoise(const std::string& field, const v1::NoiseSettings& noise,
                        filter::FilterOptions* options);
 absl::Status ReadGate(const std::string& field, const v1::GateSettings& gate, filter::GateOptions* options);
 
+filter::Projection ToProjection(v1::Projection projection);
+
 /// What a client wants of a filter with n states and n_y outputs. @param request  OpenSession, or another message with those
 /// fields. @param field  its name. Errors: InvalidArgument with violations below it.
 template <typename Message>
 absl::StatusOr<filter::FilterOptions> ReadFilterOptions(const std::string& field, const Message& request, Eigen::Index n,
                                                         Eigen::Index n_y) {
-  filter::FilterOptions options{.restart_after_divergence = !request.stay_diverged()};
+  filter::FilterOptions options{.projection = ToProjection(request.projection()),
+                                .restart_after_divergence = !request.stay_diverged()};
   METAEKF_RETURN_IF_ERROR(ReadNoise(field + ".noise", request.noise(), n, n_y, &options));
   METAEKF_RETURN_IF_ERROR(ReadGate(field + ".gate", request.gate(), &options.gate));
   return options;

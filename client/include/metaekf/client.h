@@ -247,6 +247,9 @@ struct NoiseSettings {
   std::vector<double> process_noise_cov, measurement_noise_cov, initial_mean, initial_cov;
 };
 
+/// How an estimate outside the set that the model's states lie in is put inside.
+enum class Projection { kDefault, kQuadraticProgram, kAutoencoder, kNone };
+
 /// When a measurement is taken for an outlier and left out.
 struct GateSettings {
   double probability = 0;  ///< with which a right measurement passes; 0: the server's default
@@ -264,6 +267,7 @@ struct EstimationOptions {
   double sample_period_s = 0;   ///< 0: the model's
   double max_lag_s = 0;         ///< how far behind the latest sample a measurement may be
   GateSettings gate;
+  Projection projection = Projection::kDefault;
   bool stay_diverged = false;   ///< do not begin anew after a divergence
   size_t max_in_flight = 8192;  ///< samples that may wait for their answer
   size_t max_kept = 65536;      ///< answered samples kept for Resume
@@ -328,6 +332,7 @@ struct SmoothingRequest {
   Target target;
   NoiseSettings noise;
   GateSettings gate;
+  Projection projection = Projection::kDefault;
   CovarianceFormat covariance = CovarianceFormat::kDiagonal;
   Trajectory trajectory;  ///< NaN in outputs: not measured
 };

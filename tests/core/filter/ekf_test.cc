@@ -385,6 +385,42 @@ TEST(EkfTest, EstimatesOfConstrainedStatesAreInsideWhateverTheWeights) {
   EXPECT_GT(projected, 50000);
 }
 
+TEST(EkfTest, TheAutoencoderPutsEstimatesInsideAndTakesTheirCovarianceAlong) {
+  int projected = 0;
+  for (const nssm::ModelCase& c : nssm::ModelCases()) {
+    if (c.name != "Case II, ordered states") continue;
+    for (uint64_t seed = 0; seed < 20; ++seed) {
+      nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(c.model));
+      bundle.parameters = nssm::RandomParameters(bundle.model, seed);
+      Filter filter(bundle, {.projection = Projection::kAutoencoder}), free(bundle, {.projection = Projection::kNone});
+      const auto& set = *bundle.model.state_set();
+      base::Rng rng(seed);
+      for (int t = 0; t < 100; ++t) {
+        const VectorXd u = RandomVector(&rng, 1), y = 3 * RandomVector(&rng, 2);
+        free.ekf.Restore(filter.ekf.state());  // the same step without projection
+        ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
+        ASSERT_TRUE(free.ekf.Step(u, y, free.scratch.get(), &free.estimate).ok());
+        EXPECT_TRUE(physics::Contains(set, filter.estimate.mean));
+        EXPECT_EQ(filter.estimate.slack, free.estimate.slack);
+        EXPECT_EQ(free.estimate.projection, 0);
+        if (filter.estimate.projection == 0) {
+          EXPECT_EQ(filter.estimate.mean, free.estimate.mean);
+          continue;
+        }
+        ++projected;
+        EXPECT_LT(free.estimate.slack, 0);
+        EXPECT_FALSE(physics::Contains(set, free.estimate.mean));
+        VectorXd reconstruction(2);
+        MatrixXd J(2, 2);
+        filter.model->Reconstruct(*filter.model->Prepare(bundle.parameters), free.ekf.state().mean, u, &reconstruction, &J, filter.scratch.get());
+        EXPECT_LT((filter.estimate.mean - reconstruction).norm(), 1e-12 * (1 + reconstruction.norm()));
+        EXPECT_LT((filter.estimate.cov - J * free.estimate.cov * J.transpose()).norm(), 1e-10 * (1 + free.estimate.cov.norm()));
+      }
+    }
+  }
+  EXPECT_GT(projected, 50);
+}
+
 #if METAEKF_COUNTS_ALLOCATIONS
 TEST(EkfTest, AStepDoesNotAllocate) {
   for (const nssm::ModelCase& c : nssm::ModelCases()) {
