@@ -29,6 +29,7 @@ struct Flags {
   double max_lag_s = 0;
   bool smooth = false;
   std::string projection = "qp";
+  int32_t initial_samples = 0;
 };
 
 /// What is kept of the estimates for the plot.
@@ -183,7 +184,7 @@ absl::Status EstimateSmoothly(const Flags& flags, Console& console) {
     rows.states.emplace_back(trajectory.states.col(t));
   }
   trajectory.states.resize(0, trajectory.length());  // not what is estimated from
-  client::SmoothingRequest request{.target = flags.target, .gate = Gate(flags), .projection = ProjectionOf(flags), .trajectory = ToClient(trajectory)};
+  client::SmoothingRequest request{.target = flags.target, .initial_samples = flags.initial_samples, .gate = Gate(flags), .projection = ProjectionOf(flags), .trajectory = ToClient(trajectory)};
   METAEKF_ASSIGN_OR_RETURN(request.noise, ReadNoise(flags));
   METAEKF_ASSIGN_OR_RETURN(const client::Smoothed smoothed, ToAbsl(console.client().Smooth(request)));
 
@@ -215,6 +216,7 @@ absl::Status Estimate(const Flags& flags, Console& console) {
   client::EstimationOptions options{.target = flags.target,
                                     .sample_period_s = flags.columns.sample_period_s,
                                     .max_lag_s = flags.max_lag_s,
+                                    .initial_samples = flags.initial_samples,
                                     .gate = Gate(flags),
                                     .projection = ProjectionOf(flags),
                                     .stay_diverged = flags.stay_diverged,
@@ -274,6 +276,10 @@ void AddEstimate(CLI::App& app, Console& console, Command& chosen) {
   command->add_option("--recover-after", flags->recover_after,
                       "Samples with outliers in a row after which they are believed (default 5)")
       ->check(CLI::PositiveNumber);
+  command->add_option("--initial-samples", flags->initial_samples,
+                      "Samples to find the first state from by least squares (models of states; default: begin with the "
+                      "fleet's mean, or that of --noise)")
+      ->check(CLI::Range(1, 1000));
   command->add_option("--projection", flags->projection,
                       "How estimates of a constrained model are put inside: qp (the most probable point, default), "
                       "autoencoder, or none")

@@ -234,6 +234,7 @@ Result<std::unique_ptr<EstimationSession>> Client::OpenEstimation(
   open->set_sample_period_s(options.sample_period_s);
   open->set_max_lag_s(options.max_lag_s);
   ToProto(options.gate, open->mutable_gate());
+  open->set_initial_samples(options.initial_samples);
   open->set_projection(static_cast<v1::Projection>(options.projection));  // the same numbers
   open->set_stay_diverged(options.stay_diverged);
 

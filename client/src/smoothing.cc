@@ -8,6 +8,7 @@ Result<Smoothed> Client::Smooth(const SmoothingRequest& request) {
   METAEKF_CLIENT_ASSIGN_OR_RETURN(*header->mutable_target(), TargetResource(request.target));
   ToProto(request.noise, header->mutable_noise());
   ToProto(request.gate, header->mutable_gate());
+  header->set_initial_samples(request.initial_samples);
   header->set_projection(static_cast<v1::Projection>(request.projection));  // the same numbers
   header->set_covariance_format(ToProto(request.covariance));
 

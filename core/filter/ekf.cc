@@ -7,6 +7,7 @@
 #include "core/base/status.h"
 #include "core/filter/chi_squared.h"
 #include "core/filter/constrain.h"
+#include "core/filter/least_squares_start.h"
 #include "core/filter/square_root.h"
 #include "core/physics/projection.h"
 
@@ -18,6 +19,7 @@ using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
 
+constexpr int32_t kMaxInitialSamples = 1000;
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 
 /// A ← D⁻¹ A D⁻¹: a covariance from physical to normalised units.
@@ -71,7 +73,12 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
   ekf.input_size_ = spec.input_size;
   ekf.output_size_ = spec.output_size;
   ekf.state_size_ = ekf.model_->state_size();
-  ekf.window_size_ = ekf.case_one_ ? static_cast<size_t>(bundle.model.start_size()) : 0;
+  if (options.initial_samples != 0 && (ekf.case_one_ || options.initial_samples < 0 || options.initial_samples > kMaxInitialSamples)) {
+    return absl::InvalidArgumentError(
+        absl::StrCat("initial samples: must be from 0 to ", kMaxInitialSamples, ", and 0 in Case I, got ", options.initial_samples));
+  }
+  ekf.window_size_ = static_cast<size_t>(ekf.case_one_ ? bundle.model.start_size()
+                                                       : int64_t{options.initial_samples} * (spec.input_size + spec.output_size));
   ekf.normaliser_ = bundle.normaliser;
   const physics::Polyhedron* const set = ekf.case_one_ ? bundle.model.output_set() : bundle.model.state_set();
   if (set != nullptr) ekf.set_ = *set;
@@ -223,15 +230,29 @@ absl::StatusOr<std::vector<Estimate>> Ekf::Forecast(const MatrixXd& inputs, Filt
 
 void Ekf::FillWindow(FilterModel::Scratch* scratch) {
   // The encoder has no place for a value that was not measured: the window starts anew behind it.
-  if (y_.hasNaN()) {
+  if (case_one_ && y_.hasNaN()) {
     state_.window.clear();
     return;
   }
   for (Index i = 0; i < input_size_; ++i) state_.window.push_back(u_[i]);
   for (Index i = 0; i < output_size_; ++i) state_.window.push_back(y_[i]);
-  if (state_.window.size() < window_size_) return;
-  model_->Encode(*parameters_, Eigen::Map<const VectorXd>(state_.window.data(), static_cast<Index>(window_size_)),
-                 &state_.mean, scratch);
+  if (state_.window.size() == window_size_) BeginFromWindow(scratch);
+}
+
+void Ekf::BeginFromWindow(FilterModel::Scratch* scratch) {
+  const Index size = static_cast<Index>(window_size_), channels = input_size_ + output_size_;
+  if (case_one_) {
+    model_->Encode(*parameters_, Eigen::Map<const VectorXd>(state_.window.data(), size), &state_.mean, scratch);
+    return;
+  }
+  const Eigen::Map<const MatrixXd> window(state_.window.data(), channels, size / channels);
+  StateEstimate start = LeastSquaresStart(*model_, *parameters_,
+                                          {.inputs = window.topRows(input_size_), .outputs = window.bottomRows(output_size_),
+                                           .next_input = next_input_, .prior_mean = initial_mean_, .prior_factor = initial_factor_,
+                                           .process_factor = process_factor_, .measurement_cov = measurement_cov_},
+                                          scratch);
+  state_.mean = std::move(start.mean);
+  state_.factor = std::move(start.factor);
 }
 
 void Ekf::TimeUpdate(FilterModel::Scratch* scratch) {

@@ -40,6 +40,9 @@ struct FilterOptions {
   std::optional<Eigen::MatrixXd> measurement_cov;  ///< R, n_y × n_y, positive definite
   std::optional<Eigen::VectorXd> initial_mean;     ///< Case II: x⁻ at the first sample; default the fleet's mean
   std::optional<Eigen::MatrixXd> initial_cov;      ///< n × n, positive semidefinite
+  /// Case II: the state is first found by least squares from so many samples (LeastSquaresStart); they give no estimates but the
+  /// last. 0: the filter begins at once from the initial mean and covariance, which are the prior of that fit else.
+  int32_t initial_samples = 0;
   GateOptions gate;
   Projection projection = Projection::kQuadraticProgram;
   bool restart_after_divergence = true;  ///< begin anew, from the initial condition, with the sample after one that diverged
@@ -50,7 +53,7 @@ struct FilterState {
   Eigen::VectorXd mean;            ///< x⁺ after the last sample; Case II before the first: x⁻
   Eigen::MatrixXd factor;          ///< L with P = L Lᵀ
   Eigen::VectorXd last_input;      ///< u of the last sample
-  std::vector<double> window;      ///< Case I: the samples of the window so far
+  std::vector<double> window;      ///< Case I, and with initial_samples: the samples so far that the state is to be found from
   int64_t samples = 0;             ///< applied so far
   NisMonitor nis;
   int64_t gated_in_row = 0;        ///< samples until the last that lost components
@@ -135,7 +138,8 @@ class Ekf {
  private:
   Ekf() = default;
 
-  void FillWindow(FilterModel::Scratch* scratch);  // Case I: adds (u_, y_), encodes when full
+  void FillWindow(FilterModel::Scratch* scratch);  // adds (u_, y_), begins when full
+  void BeginFromWindow(FilterModel::Scratch* scratch);
   void TimeUpdate(FilterModel::Scratch* scratch);
   void MeasurementUpdate(const Eigen::MatrixXd& R, FilterModel::Scratch* scratch, Estimate* estimate);
   // L⁻ to L⁺ by some components of y; leaves S^½ and K S^½ in update_work_ and S^−½ ỹ in whitened_. Returns their NIS.
@@ -146,14 +150,14 @@ class Ekf {
   void Restart();
   void PutInside(FilterModel::Scratch* scratch, Estimate* estimate);
   void JudgeHealth(Estimate* estimate);
-  bool warming_up() const { return case_one_ && state_.window.size() < window_size_; }
+  bool warming_up() const { return state_.window.size() < window_size_; }
 
   std::shared_ptr<const FilterModel> model_;
   std::shared_ptr<const FilterModel::Parameters> parameters_;
   bool case_one_ = false;
   bool next_input_ = false;  // f takes the input of the sample it leads to
   int32_t input_size_ = 0, output_size_ = 0, state_size_ = 0;
-  size_t window_size_ = 0;  // Case I: values in a full window
+  size_t window_size_ = 0;  // values in a full window
   data::Normaliser normaliser_;
   std::optional<physics::Polyhedron> set_;             // of what is estimated, in physical units
   std::optional<physics::Polyhedron> normalised_set_;  // of the state

@@ -5,7 +5,7 @@
 namespace metaekf::filter {
 
 enum class Health {
-  kWarmingUp,       ///< Case I before the first window is full: no estimate yet
+  kWarmingUp,       ///< before the first window is full: no estimate yet
   kConsistent,      ///< innovations are as large as their covariance says
   kOverconfident,   ///< they are larger: bounds are too narrow
   kUnderconfident,  ///< they are smaller: bounds are too wide

@@ -1,5 +1,6 @@
 #include "core/filter/square_root.h"
 
+#include <algorithm>
 #include <cmath>
 
 #include "absl/strings/str_cat.h"
@@ -42,12 +43,14 @@ absl::StatusOr<MatrixXd> SemidefiniteFactor(const MatrixXd& a) {
   if (a.cols() != n) return absl::InvalidArgumentError(absl::StrCat("a covariance must be square, got ", n, " × ", a.cols()));
   if (!a.allFinite()) return absl::InvalidArgumentError("a covariance must be finite");
   const double scale = n > 0 ? a.diagonal().cwiseAbs().maxCoeff() : 0;
-  const double tolerance = 1e-12 * static_cast<double>(n) * scale;
+  // Rounding is judged by each quantity's own variance: their units may be far apart.
+  const double relative = 1e-12 * static_cast<double>(n), least = 1e-12 * relative * scale;
   if (!(a - a.transpose()).isZero(1e-9 * scale)) return absl::InvalidArgumentError("a covariance must be symmetric");
   MatrixXd l = MatrixXd::Zero(n, n);
   for (Index j = 0; j < n; ++j) {
     double pivot = a(j, j);
     for (Index k = 0; k < j; ++k) pivot -= l(j, k) * l(j, k);
+    const double tolerance = std::max(least, relative * a(j, j));
     if (pivot < -tolerance) {
       return absl::InvalidArgumentError(absl::StrCat("a covariance must be positive semidefinite; pivot ", j, " is ", pivot));
     }
@@ -57,7 +60,7 @@ absl::StatusOr<MatrixXd> SemidefiniteFactor(const MatrixXd& a) {
       double rest = a(i, j);
       for (Index k = 0; k < j; ++k) rest -= l(i, k) * l(j, k);
       // A direction without variance has no covariance with others either.
-      if (zero && std::fabs(rest) > std::sqrt(tolerance * scale) + tolerance) {
+      if (zero && std::fabs(rest) > std::sqrt(relative * std::max(a(i, i), least) * std::max(a(j, j), least)) + least) {
         return absl::InvalidArgumentError(absl::StrCat("a covariance must be positive semidefinite; see row ", i));
       }
       l(i, j) = zero ? 0 : rest / l(j, j);

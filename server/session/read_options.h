@@ -20,7 +20,8 @@ filter::Projection ToProjection(v1::Projection projection);
 template <typename Message>
 absl::StatusOr<filter::FilterOptions> ReadFilterOptions(const std::string& field, const Message& request, Eigen::Index n,
                                                         Eigen::Index n_y) {
-  filter::FilterOptions options{.projection = ToProjection(request.projection()),
+  filter::FilterOptions options{.initial_samples = request.initial_samples(),
+                                .projection = ToProjection(request.projection()),
                                 .restart_after_divergence = !request.stay_diverged()};
   METAEKF_RETURN_IF_ERROR(ReadNoise(field + ".noise", request.noise(), n, n_y, &options));
   METAEKF_RETURN_IF_ERROR(ReadGate(field + ".gate", request.gate(), &options.gate));

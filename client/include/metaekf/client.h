@@ -266,6 +266,7 @@ struct EstimationOptions {
   bool send_innovations = false;
   double sample_period_s = 0;   ///< 0: the model's
   double max_lag_s = 0;         ///< how far behind the latest sample a measurement may be
+  int32_t initial_samples = 0;  ///< Case II: samples to find the first state from by least squares
   GateSettings gate;
   Projection projection = Projection::kDefault;
   bool stay_diverged = false;   ///< do not begin anew after a divergence
@@ -331,6 +332,7 @@ struct EstimateBatch {
 struct SmoothingRequest {
   Target target;
   NoiseSettings noise;
+  int32_t initial_samples = 0;  ///< Case II: samples to find the first state from by least squares
   GateSettings gate;
   Projection projection = Projection::kDefault;
   CovarianceFormat covariance = CovarianceFormat::kDiagonal;

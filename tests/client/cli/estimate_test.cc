@@ -53,13 +53,14 @@ TEST_F(EstimateTest, AFileIsSentInBatchesAndItsEstimatesWritten) {
 TEST_F(EstimateTest, GateAndLagAreAskedFor) {
   const std::string late = "t,u1,y1\n0,0,1\n0.5,0,\n1,0,3\n0.5,0,2\n";
   EXPECT_THAT(Run({}, late).err, HasSubstr("standard input:5"));  // without a lag, time is even
-  const Outcome outcome = Run({"--gate", "0.99", "--recover-after", "3", "--projection", "autoencoder", "--stay-diverged", "--max-lag-s", "2"}, late);
+  const Outcome outcome = Run({"--gate", "0.99", "--recover-after", "3", "--projection", "autoencoder", "--initial-samples", "12", "--stay-diverged", "--max-lag-s", "2"}, late);
   ASSERT_EQ(outcome.status, 0) << outcome.err;
   EXPECT_EQ(server_.estimation.open.gate().probability(), 0.99);
   EXPECT_EQ(server_.estimation.open.gate().recover_after(), 3);
   EXPECT_FALSE(server_.estimation.open.gate().off());
   EXPECT_TRUE(server_.estimation.open.stay_diverged());
   EXPECT_EQ(server_.estimation.open.projection(), v1::AUTOENCODER);
+  EXPECT_EQ(server_.estimation.open.initial_samples(), 12);
   EXPECT_EQ(server_.estimation.open.max_lag_s(), 2);
   EXPECT_EQ(server_.estimation.batches.back().times_s(0), 0.5);
   ASSERT_EQ(Run({"--gate", "0"}, late.substr(0, 20)).status, 0);

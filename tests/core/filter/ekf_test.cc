@@ -351,6 +351,8 @@ TEST(EkfTest, WrongNoiseIsRefusedByName) {
   EXPECT_NE(message({.measurement_cov = MatrixXd::Zero(2, 2)}).find("positive definite"), std::string::npos);
   EXPECT_NE(message({.initial_cov = -MatrixXd::Identity(2, 2)}).find("initial covariance"), std::string::npos);
   EXPECT_NE(message({.initial_mean = VectorXd::Zero(3)}).find("initial mean"), std::string::npos);
+  EXPECT_NE(message({.initial_samples = -1}).find("initial samples"), std::string::npos);
+  EXPECT_NE(message({.initial_samples = 5000}).find("initial samples"), std::string::npos);
   EXPECT_NE(message({.gate = {.probability = 1}}).find("gate"), std::string::npos);
   EXPECT_NE(message({.gate = {.recover_after = 0}}).find("gate"), std::string::npos);
 }
@@ -383,6 +385,52 @@ TEST(EkfTest, EstimatesOfConstrainedStatesAreInsideWhateverTheWeights) {
   }
   EXPECT_GT(estimates, 1000000);
   EXPECT_GT(projected, 50000);
+}
+
+// On a linear system it does not matter what is linearised about.
+TEST(EkfTest, AStartByLeastSquaresIsTheFiltersOnALinearSystem) {
+  const nssm::Bundle bundle = LinearBundle(LinearSystem());
+  Filter started(bundle, {.initial_samples = 7}), filter(bundle);
+  base::Rng rng(3);
+  for (int t = 0; t < 20; ++t) {
+    const VectorXd u = RandomVector(&rng, 1);
+    VectorXd y = RandomVector(&rng, 2);
+    if (t % 3 == 1) y[1] = kNaN;
+    ASSERT_TRUE(started.ekf.Step(u, y, started.scratch.get(), &started.estimate).ok());
+    ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
+    EXPECT_EQ(started.estimate.health == Health::kWarmingUp, t < 6);
+    EXPECT_EQ(started.estimate.mean.allFinite(), t >= 6);
+    if (t < 6) continue;
+    EXPECT_LT((started.estimate.mean - filter.estimate.mean).norm(), 1e-10) << t;
+    EXPECT_LT((started.estimate.cov - filter.estimate.cov).norm(), 1e-10) << t;
+  }
+}
+
+// A million steps with hardly any noise, an almost exact sensor beside a coarse one, and long gaps.
+TEST(EkfTest, TheCovarianceStaysPositiveSemidefiniteForAMillionSteps) {
+  for (const auto precision : {nssm::Precision::kFloat32, nssm::Precision::kFloat64}) {
+    for (nssm::ModelCase c : nssm::ModelCases()) {
+      if (c.name != "Case II, ordered states") continue;
+      c.model.precision = precision;
+      nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(c.model));
+      bundle.parameters = nssm::RandomParameters(bundle.model, 3);
+      nssm::RoundToPrecision(precision, &bundle.parameters);
+      bundle.noise.process = 1e-14 * MatrixXd::Identity(2, 2);
+      bundle.noise.measurement = Eigen::Vector2d(1e-12, 1e4).asDiagonal();
+      Filter filter(bundle);
+      base::Rng rng(1);
+      for (int t = 0; t < 500'000; ++t) {
+        const bool gap = t % 1000 < 500;
+        const VectorXd u = RandomVector(&rng, 1), y = gap ? VectorXd::Constant(2, kNaN) : RandomVector(&rng, 2);
+        ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
+        const MatrixXd& P = filter.estimate.cov;
+        ASSERT_EQ(P(0, 1), P(1, 0)) << t;
+        // Positive semidefinite to the rounding of P itself.
+        ASSERT_GE(P.determinant(), -1e-15 * P(0, 0) * P(1, 1)) << t;
+        ASSERT_GE(std::min(P(0, 0), P(1, 1)), 0) << t;
+      }
+    }
+  }
 }
 
 TEST(EkfTest, TheAutoencoderPutsEstimatesInsideAndTakesTheirCovarianceAlong) {

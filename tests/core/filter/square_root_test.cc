@@ -42,6 +42,15 @@ TEST(SquareRootTest, SemidefiniteMatricesHaveFactors) {
   EXPECT_TRUE(SemidefiniteFactor(MatrixXd::Zero(3, 3))->isZero());
 }
 
+TEST(SquareRootTest, VariancesMayBeFarApart) {
+  const MatrixXd a{{1e-12, 3e-5}, {3e-5, 1e4}};
+  const absl::StatusOr<MatrixXd> l = SemidefiniteFactor(a);
+  ASSERT_TRUE(l.ok()) << l.status();
+  EXPECT_NEAR((*l)(0, 0), 1e-6, 1e-18);
+  EXPECT_TRUE((*l * l->transpose()).isApprox(a, 1e-12));
+  EXPECT_FALSE(SemidefiniteFactor(MatrixXd{{1e-12, 3e-3}, {3e-3, 1e4}}).ok());  // a correlation of 30
+}
+
 TEST(SquareRootTest, WhatIsNoCovarianceIsRefused) {
   MatrixXd indefinite(2, 2), asymmetric(2, 2), nan(1, 1);
   indefinite << 1, 2, 2, 1;
