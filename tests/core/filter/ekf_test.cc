@@ -51,6 +51,51 @@ TEST(FilterModelTest, JacobiansMatchCentralDifferencesForEveryKindOfModel) {
   }
 }
 
+// In two dimensions and three, for every smooth activation, at all sizes of weights and states: ∂h_i/∂p_j = ∂h_j/∂p_i, in the EKF's exact H
+// and in central differences of h.
+TEST(FilterModelTest, ACurlFreeFieldHasASymmetricJacobianEverywhere) {
+  using autodiff::Activation;
+  double worst = 0;
+  for (const Activation activation : {Activation::kSwish, Activation::kTanh, Activation::kMish, Activation::kSoftplus}) {
+    for (const std::vector<int32_t>& positions : {std::vector<int32_t>{0, 2}, {3, 0, 1}}) {
+      const nn::BlockSpec block{.hidden_widths = {8, 6}, .activation = activation};
+      nssm::ModelSpec spec{.kind = nssm::Case::kStateInputOutput, .input_size = 1, .output_size = static_cast<int32_t>(positions.size()),
+                           .state_size = 4, .latent_size = 5, .window = 1};
+      spec.encoder = spec.output_decoder = block;
+      spec.curl_free_positions = positions;
+      spec.precision = nssm::Precision::kFloat64;
+      const nssm::Model model = *nssm::Model::Create(spec);
+      const auto filter_model = FilterModel::Create(nssm::Bundle{.model = model});
+      const auto scratch = filter_model->MakeScratch();
+      base::Rng rng(3);
+      const Eigen::Index d = spec.output_size;
+      VectorXd h(d), up(d), down(d);
+      MatrixXd H(d, 4), unused(d, 4);
+      for (int trial = 0; trial < 200; ++trial) {
+        std::vector<double> parameters = nssm::RandomParameters(model, static_cast<uint64_t>(trial));
+        const double size = std::pow(10.0, rng.Uniform(-1, 0.5));
+        for (double& value : parameters) value *= size;
+        const auto prepared = filter_model->Prepare(parameters);
+        const VectorXd x = std::pow(10.0, rng.Uniform(-2, 1)) * RandomVector(&rng, 4), u = RandomVector(&rng, 1);
+        filter_model->Measurement(*prepared, x, u, &h, &H, scratch.get());
+        const MatrixXd J = H(Eigen::all, positions);
+        if (J.norm() == 0) continue;
+        worst = std::max(worst, (J - J.transpose()).norm() / J.norm());
+        MatrixXd differences(d, d);
+        constexpr double kStep = 1e-5;
+        for (Eigen::Index j = 0; j < d; ++j) {
+          const VectorXd step = kStep * VectorXd::Unit(4, positions[static_cast<size_t>(j)]);
+          filter_model->Measurement(*prepared, x + step, u, &up, &unused, scratch.get());
+          filter_model->Measurement(*prepared, x - step, u, &down, &unused, scratch.get());
+          differences.col(j) = (up - down) / (2 * kStep);
+        }
+        EXPECT_LT((differences - J).norm(), 1e-6 * (J.norm() + h.norm()) + 1e-9) << trial;  // what rounding leaves of a difference
+      }
+    }
+  }
+  EXPECT_LT(worst, 1e-12);
+}
+
 // Oracle: the exact Kalman filter with textbook formulas, with missing components and wholly missing samples.
 TEST(EkfTest, EqualsTheKalmanFilterOnALinearSystem) {
   const LinearSystem s;
