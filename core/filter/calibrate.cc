@@ -106,7 +106,7 @@ double Score(const nssm::Bundle& bundle, const nssm::FilterNoise& noise, const s
 
 }  // namespace
 
-nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, double prior_std,
+nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, const CalibrationPrior& prior,
                             base::Executor* executor) {
   const std::shared_ptr<const FilterModel> model = FilterModel::Create(bundle);
   std::vector<Prepared> prepared;
@@ -123,7 +123,9 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
     executor->ParallelFor(prepared.size(), [&](size_t i, size_t) { scores[i] = Score(bundle, noise, model, prepared[i]); });
     double sum = 0;
     for (const double score : scores) sum += score;
-    return sum / static_cast<double>(scores.size()) - 0.5 * log_scales.squaredNorm() / (prior_std * prior_std);
+    return sum / static_cast<double>(scores.size()) -
+           0.5 * (log_scales.head(layout.process) / prior.process_std).squaredNorm() -
+           0.5 * (log_scales.tail(layout.measurement) / prior.measurement_std).squaredNorm();
   };
 
   VectorXd best = VectorXd::Zero(layout.size());

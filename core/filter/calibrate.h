@@ -1,5 +1,6 @@
 #pragma once
 
+#include <limits>
 #include <vector>
 
 #include "core/base/executor.h"
@@ -14,6 +15,12 @@ struct CalibrationRun {
   data::Trajectory trajectory;  ///< physical units; Case II with states
 };
 
+/// How far Q and R may be from what they were; infinite: as far as the recordings say.
+struct CalibrationPrior {
+  double process_std = std::numeric_limits<double>::infinity();
+  double measurement_std = std::numeric_limits<double>::infinity();
+};
+
 /// Q and R with which filters explain recordings best.
 ///
 /// A residual's second moment is the right Q only if model errors are white. Those of an adapted model are not: they last, and a
@@ -26,10 +33,10 @@ struct CalibrationRun {
 /// of the identity. By coordinate search in ln d², all of Q and all of R first, to a tenth.
 ///
 /// @param bundle  with Q₀, R₀ and P₀ in its noise. @param runs  at least one, of systems that the parameters were not fitted to, or of
-///   samples that come after those. @param prior_std  s, of ln d²; infinite: no prior.
+///   samples that come after those. @param prior  s of ln d², beside the mean over samples.
 /// @return the noise with Q and R scaled; as it was where no filter stays finite.
 /// Source: maximum likelihood of innovations, e.g. R. K. Mehra, IEEE Trans. Autom. Control 15 (1970) 175; the scaling is ours.
-nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, double prior_std,
+nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, const CalibrationPrior& prior,
                             base::Executor* executor);
 
 }  // namespace metaekf::filter

@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 
 #include "core/base/numbers.h"
 #include "core/base/status.h"
@@ -102,7 +101,7 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const Trai
     runs.push_back({parameters[i], std::move(run)});
   }
   bundle.noise = noise.Result(bundle.normaliser);
-  return filter::Calibrate(bundle, runs, std::numeric_limits<double>::infinity(), executor);
+  return filter::Calibrate(bundle, runs, {}, executor);
 }
 
 /// The rates that were learned become part of what the model file says of its training and of adaptation.

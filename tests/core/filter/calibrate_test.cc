@@ -11,7 +11,7 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-constexpr double kNoPrior = std::numeric_limits<double>::infinity();
+constexpr CalibrationPrior kNoPrior;
 
 std::vector<CalibrationRun> Runs(const nssm::Bundle& bundle, int count, Index steps) {
   std::vector<CalibrationRun> runs;
@@ -80,7 +80,7 @@ TEST(CalibrateTest, CountsThatErrorsOfAModelLast) {
 TEST(CalibrateTest, AStrongPriorKeepsWhatIsThere) {
   nssm::Bundle bundle = LinearBundle(LinearSystem());
   bundle.noise.process *= 5;
-  const nssm::FilterNoise kept = Calibrate(bundle, Runs(bundle, 1, 100), 1e-3, base::CallingThread());
+  const nssm::FilterNoise kept = Calibrate(bundle, Runs(bundle, 1, 100), {1e-3, 1e-3}, base::CallingThread());
   EXPECT_NEAR(kept.process(0, 0) / bundle.noise.process(0, 0), 1, 0.01);
 }
 
