@@ -381,7 +381,7 @@ void Ekf::Describe(const VectorXd& mean, const MatrixXd& factor, const VectorXd&
 
 void Ekf::PutInside(FilterModel::Scratch* scratch, Estimate* estimate) {
   estimate->slack = estimate->projection = kNaN;
-  if (!normalised_set_ || !state_.mean.allFinite() || !state_.factor.allFinite()) return;
+  if (!normalised_set_ || warming_up() || !state_.mean.allFinite() || !state_.factor.allFinite()) return;
   if (projection_ == Projection::kQuadraticProgram) {
     const ConstraintEffect effect = Constrain(*normalised_set_, &state_.mean, &state_.factor);
     estimate->slack = effect.slack;

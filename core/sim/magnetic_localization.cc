@@ -67,13 +67,9 @@ absl::StatusOr<data::Trajectory> SimulateRun(const Run& run, base::Rng& rng) {
   if (!(sphere.radius_m > 0)) {
     return absl::InvalidArgumentError(absl::StrCat("r_0 is ", base::FormatShort(sphere.radius_m), " m; it must be positive"));
   }
-  if (run.input != nullptr && run.input->hold != Hold::kZero) {
-    return absl::InvalidArgumentError("inputs of this system are held from sample to sample: use the hold \"zero\"");
-  }
-  const Eigen::Index steps = run.steps.value_or(run.input != nullptr ? run.input->values.cols() : kDefaultSteps);
-  if (run.input != nullptr && steps > run.input->values.cols()) {
-    return absl::InvalidArgumentError(
-        absl::StrCat("the recorded input has ", run.input->values.cols(), " samples, ", steps, " are asked for"));
+  Eigen::Index steps = run.steps.value_or(kDefaultSteps);
+  if (run.input != nullptr) {
+    METAEKF_ASSIGN_OR_RETURN(steps, StepsOfHeldInput(run));
   }
   const double position_std = run.settings.Number("position_std"), heading_std = run.settings.Number("heading_std");
   const double noise_std = run.settings.Number("noise_std");

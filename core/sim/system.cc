@@ -92,6 +92,17 @@ const std::string& Settings::Choice(const std::string& option) const {
   return found->second;
 }
 
+absl::StatusOr<Eigen::Index> StepsOfHeldInput(const Run& run) {
+  if (run.input->hold != Hold::kZero) {
+    return absl::InvalidArgumentError("inputs of this system are held from sample to sample: use the hold \"zero\"");
+  }
+  const Eigen::Index recorded = run.input->values.cols(), steps = run.steps.value_or(recorded);
+  if (steps > recorded) {
+    return absl::InvalidArgumentError(absl::StrCat("the recorded input has ", recorded, " samples, ", steps, " are asked for"));
+  }
+  return steps;
+}
+
 Option NominalOption() {
   return {.name = "nominal",
           .default_value = "0",

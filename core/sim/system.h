@@ -96,6 +96,10 @@ struct System {
   absl::StatusOr<data::Trajectory> (*simulate)(const Run& run, base::Rng& rng) = nullptr;
 };
 
+/// How many samples of its recorded input a run of a system takes whose inputs are held from sample to sample: all unless it says.
+/// Errors: InvalidArgument if the input is held otherwise, or shorter.
+absl::StatusOr<Eigen::Index> StepsOfHeldInput(const Run& run);
+
 /// The option of every system that takes all parameters from their nominal values.
 Option NominalOption();
 /// The option of every system that adds white noise to its outputs.

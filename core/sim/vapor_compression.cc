@@ -270,18 +270,11 @@ absl::StatusOr<data::Trajectory> SimulateRun(const Run& run, base::Rng& rng) {
   if (!(length_m > 0)) {
     return absl::InvalidArgumentError(absl::StrCat("pipe_length is ", base::FormatShort(length_m), " m; it must be positive"));
   }
-  if (run.input != nullptr && run.input->hold != Hold::kZero) {
-    return absl::InvalidArgumentError("inputs of this system are held from sample to sample: use the hold \"zero\"");
-  }
   data::Trajectory trajectory;
   trajectory.sample_period_s = kVaporCompressionSamplePeriodS;
   if (run.input != nullptr) {
-    const Eigen::MatrixXd& record = run.input->values;
-    const Eigen::Index steps = run.steps.value_or(record.cols());
-    if (steps > record.cols()) {
-      return absl::InvalidArgumentError(absl::StrCat("the recorded input has ", record.cols(), " samples, ", steps, " are asked for"));
-    }
-    trajectory.inputs = record.leftCols(steps);
+    METAEKF_ASSIGN_OR_RETURN(const Eigen::Index steps, StepsOfHeldInput(run));
+    trajectory.inputs = run.input->values.leftCols(steps);
     if (trajectory.inputs.minCoeff() <= 0) {
       return absl::InvalidArgumentError("a recorded frequency or valve position is not positive");
     }
