@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstdio>
 
 #include "absl/strings/str_cat.h"
@@ -65,6 +66,22 @@ const char* Hex(Colour colour, size_t position) {
       "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#222222"};
   if (colour == Colour::kAutomatic) return kPalette[position % 6];
   return kPalette[static_cast<size_t>(colour) - 1];
+}
+
+std::string ScaleColour(double share) {
+  static constexpr std::array<std::array<double, 3>, 4> kStops = {
+      {{255, 246, 204}, {245, 173, 92}, {196, 66, 94}, {58, 15, 92}}};
+  const double place = std::clamp(share, 0.0, 1.0) * (kStops.size() - 1);
+  const size_t below = std::min(static_cast<size_t>(place), kStops.size() - 2);
+  const double weight = place - static_cast<double>(below);
+  std::array<int, 3> rgb{};
+  for (size_t i = 0; i < 3; ++i) {
+    rgb[i] = static_cast<int>(std::lround(kStops[below][i] + weight * (kStops[below + 1][i] - kStops[below][i])));
+  }
+  char text[8];
+  std::snprintf(text, sizeof(text), "#%02x%02x%02x", static_cast<unsigned>(rgb[0]), static_cast<unsigned>(rgb[1]),
+                static_cast<unsigned>(rgb[2]));
+  return text;
 }
 
 double TextWidthPx(const std::string& text) {

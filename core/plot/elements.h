@@ -22,6 +22,10 @@ void Line(double x1, double y1, double x2, double y2, const char* colour, std::s
 /// The colour as #rrggbb; an automatic one goes by `position`, the number of the series or band.
 const char* Hex(Colour colour, size_t position);
 
+/// A scale of colours as #rrggbb, from pale yellow at 0 over orange to dark violet at 1: lightness falls evenly, for readers who see no
+/// colours. Shares beyond have the end's.
+std::string ScaleColour(double share);
+
 /// About how wide a text is.
 double TextWidthPx(const std::string& text);
 

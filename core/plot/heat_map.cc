@@ -1,9 +1,7 @@
 #include "core/plot/heat_map.h"
 
 #include <algorithm>
-#include <array>
 #include <cmath>
-#include <cstdio>
 
 #include "absl/strings/str_cat.h"
 #include "core/base/numbers.h"
@@ -14,23 +12,6 @@ namespace metaekf::plot {
 namespace {
 
 constexpr double kCellWidthPx = 66, kCellHeightPx = 26, kTopPx = 42, kBottomPx = 52, kRightPx = 18;
-
-/// From pale yellow over orange to dark violet: lightness falls evenly, for readers who see no colours.
-std::string ColourAt(double share) {
-  static constexpr std::array<std::array<double, 3>, 4> kStops = {
-      {{255, 246, 204}, {245, 173, 92}, {196, 66, 94}, {58, 15, 92}}};
-  const double place = std::clamp(share, 0.0, 1.0) * (kStops.size() - 1);
-  const size_t below = std::min(static_cast<size_t>(place), kStops.size() - 2);
-  const double weight = place - static_cast<double>(below);
-  std::array<int, 3> rgb{};
-  for (size_t i = 0; i < 3; ++i) {
-    rgb[i] = static_cast<int>(std::lround(kStops[below][i] + weight * (kStops[below + 1][i] - kStops[below][i])));
-  }
-  char text[8];
-  std::snprintf(text, sizeof(text), "#%02x%02x%02x", static_cast<unsigned>(rgb[0]), static_cast<unsigned>(rgb[1]),
-                static_cast<unsigned>(rgb[2]));
-  return text;
-}
 
 /// Share of the colour scale of every value.
 class Scale {
@@ -54,7 +35,7 @@ class Scale {
 
 void DrawCell(double left, double top, double value, double share, std::string& svg) {
   absl::StrAppend(&svg, "<rect x=\"", Number(left), "\" y=\"", Number(top), "\" width=\"", Number(kCellWidthPx),
-                  "\" height=\"", Number(kCellHeightPx), "\" fill=\"", ColourAt(share), "\" stroke=\"white\"/>\n");
+                  "\" height=\"", Number(kCellHeightPx), "\" fill=\"", ScaleColour(share), "\" stroke=\"white\"/>\n");
   const char* ink = share > 0.55 ? " text-anchor=\"middle\" style=\"fill:white\"" : " text-anchor=\"middle\"";
   Text(left + kCellWidthPx / 2, top + kCellHeightPx / 2 + 4, base::FormatShort(value, 3), ink, svg);
 }
