@@ -73,6 +73,8 @@ absl::StatusOr<double> GaussianPriorSeconds(meta::TrainingSpec spec, data::Datas
   fleet.trajectories.resize(std::min<size_t>(fleet.trajectories.size(), 2));
   spec.gaussian_prior.restarts = 1;
   spec.gaussian_prior.first_steps = kProbeSteps;
+  spec.gaussian_prior.meta_iterations = 0;  // timed by itself
+  spec.inner_loop.learned_rates = spec.inner_loop.curvature_rates = false;
   spec.validation_share = 0;
   METAEKF_ASSIGN_OR_RETURN(const std::vector<double> times, Probe(spec, fleet, 1));
   return times[0] / (kProbeSteps + 1) * steps / std::max(1U, std::thread::hardware_concurrency());
@@ -85,6 +87,13 @@ absl::StatusOr<TrainingEstimate> EstimateTraining(const nlohmann::json& specific
   const bool by_fits = spec.algorithm == meta::Algorithm::kGaussianPrior;
   TrainingEstimate estimate;
   METAEKF_ASSIGN_OR_RETURN(estimate.duration_s, by_fits ? GaussianPriorSeconds(spec, fleet) : GradientSeconds(spec, fleet));
+  if (by_fits && spec.gaussian_prior.meta_iterations > 0) {
+    meta::TrainingSpec meta = spec;
+    meta.algorithm = meta::Algorithm::kMaml;
+    meta.iterations = spec.gaussian_prior.meta_iterations;
+    METAEKF_ASSIGN_OR_RETURN(const double seconds, GradientSeconds(meta, fleet));
+    estimate.duration_s += seconds;
+  }
   rusage usage{};
   getrusage(RUSAGE_SELF, &usage);
   estimate.memory_mib = static_cast<double>(usage.ru_maxrss) * 1024 / kMib;

@@ -8,6 +8,7 @@ bool IsSmooth(Activation activation) {
     case Activation::kSwish:
     case Activation::kMish:
     case Activation::kSoftplus:
+    case Activation::kSine:
       return true;
     default:
       return false;
@@ -21,7 +22,7 @@ bool DerivativeIsZero(Activation activation, int order) {
 }
 
 double DefaultParameter(Activation activation) {
-  return activation == Activation::kLeakyRelu ? 0.01 : activation == Activation::kElu ? 1.0 : 0.0;
+  return activation == Activation::kLeakyRelu ? 0.01 : activation == Activation::kElu || activation == Activation::kSwish ? 1.0 : 0.0;
 }
 
 }  // namespace metaekf::autodiff

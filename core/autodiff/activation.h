@@ -16,6 +16,7 @@ enum class Activation : uint8_t {
   kSwish,     // z / (1 + e^{−z})
   kMish,      // z tanh(log(1 + eᶻ))
   kSoftplus,  // log(1 + eᶻ)
+  kSine,      // sin z, |z| below 10⁴
 };
 
 /// The highest derivative that Apply knows: a curl-free output takes one derivative, its loss's
@@ -32,7 +33,7 @@ bool IsSmooth(Activation activation);
 /// Whether the derivative of this order is zero everywhere (where it exists).
 bool DerivativeIsZero(Activation activation, int order);
 
-/// The parameter `a` that a function has by default (0 where it has none).
+/// The parameter that a function has by default: `a`, or β of swish, which callers apply themselves (nn::Block); 0 where it has none.
 double DefaultParameter(Activation activation);
 
 /// out_i = σ^(order)(z_i), i < count; in place is allowed. At the kink of a piecewise function the

@@ -2,6 +2,7 @@
 //   sigmoid s: s' = s(1−s), s'' = s'(1−2s), s''' = s'(1−6s+6s²)
 //   tanh t:    t' = 1−t², t'' = −2t t', t''' = t'(6t²−2)
 //   swish      n-th derivative z s⁽ⁿ⁾ + n s⁽ⁿ⁻¹⁾
+//   sine       sin, cos, −sin, −cos
 //   mish       z m with m = tanh ∘ softplus: z m⁽ⁿ⁾ + n m⁽ⁿ⁻¹⁾, m⁽ⁿ⁾ by Faà di Bruno
 
 #include <algorithm>
@@ -142,6 +143,14 @@ struct Mish {
   }
 };
 
+struct Sine {
+  template <int order, class D>
+  static V<D> Apply(D d, V<D> z, V<D>) {
+    const V<D> value = order % 2 == 0 ? hn::Sin(d, z) : hn::Cos(d, z);
+    return order < 2 ? value : hn::Neg(value);
+  }
+};
+
 /// The tail is computed by the same instructions in a padded vector, so a result does not depend on where in the
 /// array an element stands.
 template <class Function, int order, typename T>
@@ -197,6 +206,8 @@ void ApplyTo(Activation activation, int order, T a, const T* z, T* out, size_t c
       return MapOrder<Mish>(order, a, z, out, count);
     case Activation::kSoftplus:
       return MapOrder<SoftplusFunction>(order, a, z, out, count);
+    case Activation::kSine:
+      return MapOrder<Sine>(order, a, z, out, count);
   }
 }
 

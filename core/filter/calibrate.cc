@@ -50,7 +50,7 @@ double LogLikelihood(const Estimate& estimate, const VectorXd& scale) {
   return -0.5 * (estimate.nis + log_determinant + static_cast<double>(rows.size()) * std::log(2 * std::numbers::pi));
 }
 
-/// A recording, the filter's parameters for it, and where it stands when its first window is full, whatever Q and R.
+/// A recording, the filter's parameters for it, and where it stands before the first sample that counts, whatever Q and R.
 struct Prepared {
   const data::Trajectory* trajectory = nullptr;
   std::shared_ptr<const FilterModel::Parameters> parameters;
@@ -65,12 +65,23 @@ absl::StatusOr<Ekf> MakeFilter(const nssm::Bundle& bundle, const nssm::FilterNoi
                       .gate = {.probability = 0}, .restart_after_divergence = false});
 }
 
+/// Case I: when the first window is full. Case II: at the first state, which was recorded; where a filter that had to guess would
+/// begin, and how long it would take to find the state, is not Q's business.
 /// Errors: those of Ekf; a recording in which no window is full begins at its end.
-absl::Status WarmUp(const nssm::Bundle& bundle, const std::shared_ptr<const FilterModel>& model, Prepared* run) {
+absl::Status Begin(const nssm::Bundle& bundle, const std::shared_ptr<const FilterModel>& model, Prepared* run) {
   METAEKF_ASSIGN_OR_RETURN(Ekf ekf, MakeFilter(bundle, bundle.noise, model, *run));
+  if (!bundle.model.spec().is_case_one()) {
+    run->start = ekf.state();
+    run->start.mean = bundle.normaliser.states.Normalise(run->trajectory->states.col(0));
+    run->start.factor.setZero();
+    run->start.last_input = bundle.normaliser.inputs.Normalise(run->trajectory->inputs.col(0));
+    run->start.started = true;
+    run->begin = 1;
+    return absl::OkStatus();
+  }
   const auto scratch = model->MakeScratch();
   Estimate estimate = ekf.MakeEstimate();
-  estimate.health = bundle.model.spec().is_case_one() ? Health::kWarmingUp : Health::kConsistent;
+  estimate.health = Health::kWarmingUp;
   for (; estimate.health == Health::kWarmingUp && run->begin < run->trajectory->length(); ++run->begin) {
     METAEKF_RETURN_IF_ERROR(ekf.Step(run->trajectory->inputs.col(run->begin), run->trajectory->outputs.col(run->begin),
                                      scratch.get(), &estimate));
@@ -112,7 +123,7 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
   std::vector<Prepared> prepared;
   for (const CalibrationRun& run : runs) {
     prepared.push_back({&run.trajectory, model->Prepare(run.parameters), {}});
-    if (!WarmUp(bundle, model, &prepared.back()).ok()) return bundle.noise;
+    if (!Begin(bundle, model, &prepared.back()).ok()) return bundle.noise;
   }
   const Layout layout{.process = bundle.model.spec().is_case_one() ? 1 : bundle.noise.process.rows(),
                       .measurement = bundle.noise.measurement.rows()};

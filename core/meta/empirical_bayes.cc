@@ -77,12 +77,13 @@ struct Population {
 class Learner {
  public:
   Learner(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask, const Systems& systems,
-          base::Executor* executor, TrainingState* state, const OnTrainingStep& on_step)
+          const std::vector<double>& shared, base::Executor* executor, TrainingState* state, const OnTrainingStep& on_step)
       : spec_(spec),
         options_(spec.gaussian_prior),
         model_(model),
         plan_(model, spec.loss, mask),
         systems_(systems),
+        shared_(shared),
         executor_(*executor),
         state_(*state),
         on_step_(on_step),
@@ -92,8 +93,8 @@ class Learner {
     METAEKF_RETURN_IF_ERROR(CheckStructure(options_, plan_.dynamics.adapted_size()));
     METAEKF_ASSIGN_OR_RETURN(data_, CutAll(plan_.dynamics));
     if (state_.values.empty()) {
-      state_.iteration = 0;
-      METAEKF_RETURN_IF_ERROR(FirstFit());
+      state_.iteration = options_.meta_iterations;
+      METAEKF_RETURN_IF_ERROR(shared_.empty() ? FirstFit() : BeginFromShared());
     } else {
       METAEKF_RETURN_IF_ERROR(Restore());
     }
@@ -108,10 +109,6 @@ class Learner {
   }
 
  private:
-  int32_t Iterations() const {
-    return options_.restarts + (options_.rounds + 1) * static_cast<int32_t>(systems_.training.size());
-  }
-
   absl::StatusOr<std::vector<LossData<double>>> CutAll(const RolloutLeastSquares& problem) const {
     std::vector<LossData<double>> all;
     for (const Trajectory& system : systems_.training) {
@@ -124,7 +121,7 @@ class Learner {
   /// Tells of `done` more fits.
   absl::Status Tell(size_t done, bool validated = false) {
     state_.iteration += static_cast<int32_t>(done);
-    if (!on_step_ || on_step_({state_, Iterations(), validated})) return absl::OkStatus();
+    if (!on_step_ || on_step_({state_, PriorIterations(options_, systems_.training.size()), validated})) return absl::OkStatus();
     return absl::CancelledError("the training was cancelled");
   }
 
@@ -135,21 +132,42 @@ class Learner {
         const SystemFit first,
         FitFromScratch(plan_, model_, spec_.loss, systems_.training[0],
                        {.seed = spec_.seed, .restarts = options_.restarts, .steps = options_.first_steps, .executor = &executor_}, nullptr));
-    const Index p = plan_.dynamics.adapted_size(), n = first.fit.unknowns.size() - p;
     start_ = first.parameters;
+    Believe(first.fit.unknowns, first.fit.noise_variance);
+    METAEKF_RETURN_IF_ERROR(Tell(static_cast<size_t>(options_.restarts)));
+    Save(0);
+    return absl::OkStatus();
+  }
+
+  /// ω₀ is there, and the noise is what a fit of one system from there leaves.
+  absl::Status BeginFromShared() {
+    start_ = shared_;
+    Believe(GatherAdapted(plan_.dynamics, shared_), VectorXd::Ones(plan_.dynamics.channels()));
+    const MapFit fit = FitMap(plan_.dynamics, data_[0], shared_, population_.belief, population_.belief.mean,
+                              {.optimiser = {.max_iterations = options_.first_steps, .tolerance = kTolerance}, .noise_samples = 1},
+                              workspaces_[0].For(plan_.dynamics, data_[0].shape));
+    if (!fit.unknowns.allFinite() || !fit.noise_variance.allFinite()) {
+      return absl::OutOfRangeError("the training diverged: no fit of the first system from what MAML has learned");
+    }
+    population_.belief.noise_variance = fit.noise_variance;
+    ++state_.iteration;
+    Save(0);  // whoever is told may keep this state, by which the training knows that MAML is done
+    return Tell(0);
+  }
+
+  /// Before the first round: N(θ, initial_std²), and every fit begins at θ.
+  void Believe(const VectorXd& unknowns, const VectorXd& noise_variance) {
+    const Index p = plan_.dynamics.adapted_size(), n = unknowns.size() - p;
     Belief& belief = population_.belief;
-    belief.mean = first.fit.unknowns;
+    belief.mean = unknowns;
     belief.mean.tail(n).setZero();
     VectorXd precision = VectorXd::Constant(p + n, 1 / (options_.initial_std * options_.initial_std));
     precision.tail(n).setOnes();  // latents are of the order of one
     belief.precision = precision.asDiagonal();
-    belief.noise_variance = first.fit.noise_variance;
-    population_.fits.assign(systems_.training.size(), first.fit.unknowns);
+    belief.noise_variance = noise_variance;
+    population_.fits.assign(systems_.training.size(), unknowns);
     population_.accepted.assign(systems_.training.size(), true);
     state_.best_validation_loss = state_.validation_loss = std::numeric_limits<double>::infinity();
-    METAEKF_RETURN_IF_ERROR(Tell(static_cast<size_t>(options_.restarts)));
-    Save(0);
-    return absl::OkStatus();
   }
 
   static int64_t Samples(const LossData<double>& data) { return int64_t{data.shape.rollouts} * data.shape.horizon; }
@@ -356,7 +374,7 @@ class Learner {
     for (const VectorXd& fit : population_.fits) fits.insert(fits.end(), fit.begin(), fit.end());
     for (const bool flag : population_.accepted) accepted.push_back(flag ? 1 : 0);
     // The inverse of a loss that may be infinite still.
-    state_.values = {{"round", {static_cast<double>(next_round), static_cast<double>(state_.iteration), 1 / state_.best_validation_loss}},
+    state_.values = {{kPriorHasBegun, {static_cast<double>(next_round), static_cast<double>(state_.iteration), 1 / state_.best_validation_loss}},
                      {"mean", Flat(population_.belief.mean)},
                      {"precision", Flat(population_.belief.precision)},
                      {"noise_precision", Flat(population_.belief.noise_variance.cwiseInverse())},
@@ -385,7 +403,7 @@ class Learner {
       }
       return Eigen::Map<const MatrixXd>(values.data(), rows, cols);
     };
-    const MatrixXd round = matrix("round", 3, 1);
+    const MatrixXd round = matrix(kPriorHasBegun, 3, 1);
     population_.belief = {.mean = matrix("mean", size, 1),
                         .precision = matrix("precision", size, size),
                         .noise_variance = matrix("noise_precision", channels, 1).cwiseInverse()};
@@ -417,6 +435,7 @@ class Learner {
   const nssm::Model& model_;
   const FitPlan plan_;
   const Systems& systems_;
+  const std::vector<double>& shared_;
   base::Executor& executor_;
   TrainingState& state_;
   const OnTrainingStep& on_step_;
@@ -431,9 +450,14 @@ class Learner {
 }  // namespace
 
 absl::StatusOr<LearnedPrior> LearnGaussianPrior(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
-                                                const Systems& systems, base::Executor* executor, TrainingState* state,
-                                                const OnTrainingStep& on_step) {
-  return Learner(spec, model, mask, systems, executor, state, on_step).Run();
+                                                const Systems& systems, const std::vector<double>& shared, base::Executor* executor,
+                                                TrainingState* state, const OnTrainingStep& on_step) {
+  return Learner(spec, model, mask, systems, shared, executor, state, on_step).Run();
+}
+
+int32_t PriorIterations(const GaussianPriorSpec& spec, size_t systems) {
+  const int32_t starts = spec.meta_iterations > 0 ? 1 : spec.restarts;
+  return spec.meta_iterations + starts + (spec.rounds + 1) * static_cast<int32_t>(systems);
 }
 
 }  // namespace metaekf::meta

@@ -64,13 +64,31 @@ absl::Status FitSpecToData(const Dataset& fleet, TrainingSpec* spec) {
   return ReadTrainingSpec(ToJson(*spec)).status();
 }
 
-/// A field stays free of curl through the normalisation only if its components share a scale, and so do the positions.
+/// A field stays free of curl through the normalisation only if its components share a scale, and so do the positions: one for the
+/// field and another for the positions, whose units have nothing to do with each other.
 std::vector<data::ScaleGroup> ScaleGroups(const ModelSpec& model) {
   if (!model.is_curl_free()) return {};
-  data::ScaleGroup group;
-  for (int32_t i = 0; i < model.output_size; ++i) group.outputs.push_back(i);
-  group.states.assign(model.curl_free_positions.begin(), model.curl_free_positions.end());
-  return {group};
+  data::ScaleGroup field, position;
+  for (int32_t i = 0; i < model.output_size; ++i) field.outputs.push_back(i);
+  position.states.assign(model.curl_free_positions.begin(), model.curl_free_positions.end());
+  return {field, position};
+}
+
+/// Before a prior is learned: ω from MAML, if it is asked for and the prior has not begun yet. Leaves the state as the prior begins.
+absl::StatusOr<std::vector<double>> SharedParameters(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
+                                                     const Systems& systems, base::Executor* executor, TrainingState* state,
+                                                     const OnTrainingStep& on_step) {
+  if (spec.gaussian_prior.meta_iterations == 0 || state->values.contains(kPriorHasBegun)) return std::vector<double>();
+  TrainingSpec meta = spec;
+  meta.algorithm = Algorithm::kMaml;
+  meta.iterations = spec.gaussian_prior.meta_iterations;
+  const int32_t iterations = PriorIterations(spec.gaussian_prior, systems.training.size());
+  const auto tell = [&](const TrainingProgress& progress) {
+    return !on_step || on_step({progress.state, iterations, progress.validated, progress.diverged});
+  };
+  METAEKF_ASSIGN_OR_RETURN(LearnedStart learned, RunOuterLoop(meta, model, mask, systems, executor, state, tell));
+  *state = TrainingState();
+  return std::move(learned.parameters);
 }
 
 /// What a filter of a system is calibrated on: at most so many samples behind its context, or all of a recording that is hardly
@@ -146,7 +164,7 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
   nssm::TakeUnits(normaliser, &spec.model);
   METAEKF_ASSIGN_OR_RETURN(const nssm::Model model, nssm::Model::Create(spec.model));
   METAEKF_ASSIGN_OR_RETURN(const nn::Mask mask, nn::ParseMask(spec.inner_loop.adapted_mask, model.layout()));
-  METAEKF_RETURN_IF_ERROR(nn::ParseMask(spec.adaptation.adapted_mask, model.layout()).status());
+  METAEKF_ASSIGN_OR_RETURN(const nn::Mask adaptation_mask, nn::ParseMask(spec.adaptation.adapted_mask, model.layout()));
   METAEKF_RETURN_IF_ERROR(CheckTensorRates(spec.inner_loop, model.layout()));
   METAEKF_RETURN_IF_ERROR(CheckTensorRates(spec.adaptation, model.layout()));
   std::vector<Trajectory> normalised;
@@ -159,7 +177,8 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
   const Systems systems{Pick(normalised, split.training), Pick(normalised, split.validation)};
   Bundle bundle{.model = model};
   if (spec.algorithm == Algorithm::kGaussianPrior) {
-    METAEKF_ASSIGN_OR_RETURN(LearnedPrior learned, LearnGaussianPrior(spec, model, mask, systems, executor, &state, on_step));
+    METAEKF_ASSIGN_OR_RETURN(const std::vector<double> shared, SharedParameters(spec, model, mask, systems, executor, &state, on_step));
+    METAEKF_ASSIGN_OR_RETURN(LearnedPrior learned, LearnGaussianPrior(spec, model, adaptation_mask, systems, shared, executor, &state, on_step));
     bundle.parameters = std::move(learned.parameters);
     bundle.prior = std::move(learned.prior);
   } else {

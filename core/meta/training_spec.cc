@@ -72,6 +72,7 @@ GaussianPriorSpec ReadGaussianPrior(JsonFields* parent) {
     const int32_t value = static_cast<int32_t>(fields.Integer(name, default_value, 0, kMany));
     return value == 0 ? default_value : value;
   };
+  spec.meta_iterations = static_cast<int32_t>(fields.Integer("meta_iterations", 0, 0, kMany));
   spec.initial_std = fields.Number("initial_std", spec.initial_std, 1e-9, 1e9);
   spec.rounds = positive("rounds", spec.rounds);
   spec.restarts = positive("restarts", spec.restarts);
@@ -112,7 +113,9 @@ void CheckInnerLoop(const TrainingSpec& spec, JsonFields* fields) {
                    "must be 0 with inner_loop.optimiser LEVENBERG_MARQUARDT, which fits rollouts alone");
     }
   }
-  if (inner.learned_rates && spec.algorithm != Algorithm::kMaml && spec.algorithm != Algorithm::kFirstOrderMaml) {
+  const bool by_maml = spec.algorithm == Algorithm::kMaml || spec.algorithm == Algorithm::kFirstOrderMaml ||
+                       (spec.algorithm == Algorithm::kGaussianPrior && spec.gaussian_prior.meta_iterations > 0);
+  if (inner.learned_rates && !by_maml) {
     fields->Fail("inner_loop.learned_rates", "only MAML and FIRST_ORDER_MAML have a gradient for the rates");
   }
   if (inner.learned_rates && inner.learning_rate < kSmallestRate) {
@@ -142,8 +145,9 @@ void CheckHorizonGrowth(const TrainingSpec& spec, JsonFields* fields) {
 
 /// Rates at the inverse curvature are found when the warm-up ends.
 void CheckCurvatureRates(const TrainingSpec& spec, JsonFields* fields) {
-  if (!spec.inner_loop.curvature_rates || spec.warmup_iterations < spec.iterations) return;
-  fields->Fail("warmup_iterations", absl::StrCat("must be less than the ", spec.iterations,
+  const int32_t iterations = spec.algorithm == Algorithm::kGaussianPrior ? spec.gaussian_prior.meta_iterations : spec.iterations;
+  if (!spec.inner_loop.curvature_rates || spec.warmup_iterations < iterations) return;
+  fields->Fail("warmup_iterations", absl::StrCat("must be less than the ", iterations,
                                                  " iterations if there are curvature_rates, which begin after the warm-up"));
 }
 
@@ -169,8 +173,11 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
   METAEKF_ASSIGN_OR_RETURN(spec.loss, nssm::ReadLossSpec(fields.Object("loss"), spec.model));
   spec.algorithm = fields.Choice("algorithm", Algorithm::kMaml, kAlgorithms);
   spec.inner_loop = ReadInnerLoop(&fields, "inner_loop", InnerLoopSpec());
-  CheckInnerLoop(spec, &fields);
   spec.gaussian_prior = ReadGaussianPrior(&fields);
+  CheckInnerLoop(spec, &fields);
+  if (spec.gaussian_prior.meta_iterations > 0 && spec.model.fits_start()) {
+    fields.Fail("gaussian_prior.meta_iterations", "must be 0 for a model whose start is FITTED, which MAML does not train");
+  }
   spec.implicit_maml = ReadImplicitMaml(&fields);
   InnerLoopSpec adaptation = spec.inner_loop;
   if (spec.algorithm == Algorithm::kGaussianPrior) {
@@ -214,7 +221,8 @@ json ToJson(const TrainingSpec& spec) {
           {"inner_loop", InnerLoopJson(spec.inner_loop)},
           {"adaptation", InnerLoopJson(spec.adaptation)},
           {"gaussian_prior",
-           {{"initial_std", spec.gaussian_prior.initial_std},
+           {{"meta_iterations", spec.gaussian_prior.meta_iterations},
+            {"initial_std", spec.gaussian_prior.initial_std},
             {"rounds", spec.gaussian_prior.rounds},
             {"restarts", spec.gaussian_prior.restarts},
             {"first_steps", spec.gaussian_prior.first_steps},

@@ -31,6 +31,7 @@ enum class PriorCovariance { kFull, kLowRank, kBlock, kManifold };
 
 /// Empirical Bayes: the message GaussianPriorSpec of spec.proto.
 struct GaussianPriorSpec {
+  int32_t meta_iterations = 0;
   double initial_std = 0.1;
   int32_t rounds = 6;
   int32_t restarts = 6;

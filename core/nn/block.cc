@@ -17,6 +17,7 @@ Block::Block(const std::string& name, const BlockSpec& spec, int32_t in, int32_t
   for (size_t layer = 0; layer < widths.size(); ++layer) {
     weights_.push_back(layout->Add(absl::StrCat(name, ".", layer, ".weight"), widths[layer], in));
     if (spec.bias) biases_.push_back(layout->Add(absl::StrCat(name, ".", layer, ".bias"), widths[layer], 1, true));
+    if (spec.trained_beta && layer + 1 < widths.size()) betas_.push_back(layout->Add(absl::StrCat(name, ".", layer, ".beta"), widths[layer], 1, true));
     in = widths[layer];
   }
 }
@@ -25,9 +26,18 @@ Value Block::AddBias(Graph* graph, const ParameterValues& parameters, size_t lay
   return spec_.bias ? graph->AddColumn(z, parameters[biases_[layer]]) : z;
 }
 
+Value Block::Activate(Graph* graph, const ParameterValues& parameters, size_t layer, Value z) const {
+  const double beta = spec_.activation_parameter;
+  if (spec_.activation != Activation::kSwish || (beta == 1 && !spec_.trained_beta)) {
+    return graph->Apply(spec_.activation, spec_.activation_parameter, 0, z);
+  }
+  const Value scaled = spec_.trained_beta ? graph->Mul(graph->Tile(parameters[betas_[layer]], 1, graph->node(z).cols), z) : graph->Scale(z, beta);
+  return graph->Scale(graph->Apply(Activation::kSwish, 1, 0, scaled), 1 / beta);
+}
+
 Value Block::ApplyFrom(Graph* graph, const ParameterValues& parameters, Value z) const {
   for (size_t layer = 1; layer < weights_.size(); ++layer) {
-    z = graph->Apply(spec_.activation, spec_.activation_parameter, 0, z);
+    z = Activate(graph, parameters, layer - 1, z);
     z = AddBias(graph, parameters, layer, graph->MatMul(parameters[weights_[layer]], z, true));
   }
   return z;
@@ -60,6 +70,10 @@ void Block::Initialise(const ParameterLayout& layout, base::Rng* rng, std::span<
   for (const size_t bias : biases_) {
     const Tensor& tensor = layout.tensors()[bias];
     std::fill_n(parameters.begin() + tensor.offset, tensor.size(), 0.0);
+  }
+  for (const size_t beta : betas_) {
+    const Tensor& tensor = layout.tensors()[beta];
+    std::fill_n(parameters.begin() + tensor.offset, tensor.size(), spec_.activation_parameter);
   }
 }
 

@@ -14,12 +14,16 @@ namespace metaekf::nn {
 struct BlockSpec {
   std::vector<int32_t> hidden_widths;  ///< none: a single linear map
   autodiff::Activation activation = autodiff::Activation::kTanh;
-  double activation_parameter = 0;  ///< slope of the leaky ReLU, α of the ELU
+  double activation_parameter = 0;  ///< slope of the leaky ReLU, α of the ELU, β of swish
+  bool trained_beta = false;        ///< of swish: every hidden unit has a β of its own, which begins as activation_parameter
   bool bias = true;
   double output_scale = 1;  ///< factor on the last layer's initial weights
 };
 
 /// z ← W_l z + b_l, with σ after every layer but the last.
+///
+/// Swish is σ(z) = z/(1 + e^{−βz}) = swish₁(βz)/β. Where β is trained, a unit is swish₁(βz)/β₀ with β₀ the one it begins with: the
+/// rest of the factor is for the next layer's weights to find.
 class Block {
  public:
   Block() = default;
@@ -35,16 +39,18 @@ class Block {
                                autodiff::Value b) const;
 
   /// Draws weights with standard deviation gain/√in (gain √2 after ReLU-like activations), biases zero; the last layer's
-  /// weights are multiplied by output_scale.
+  /// weights are multiplied by output_scale, every β is what it begins with.
   void Initialise(const ParameterLayout& layout, base::Rng* rng, std::span<double> parameters) const;
 
  private:
+  /// σ of hidden layer `layer`.
+  autodiff::Value Activate(autodiff::Graph* graph, const ParameterValues& parameters, size_t layer, autodiff::Value z) const;
   autodiff::Value ApplyFrom(autodiff::Graph* graph, const ParameterValues& parameters, autodiff::Value first) const;
   autodiff::Value AddBias(autodiff::Graph* graph, const ParameterValues& parameters, size_t layer,
                           autodiff::Value z) const;
 
   BlockSpec spec_;
-  std::vector<size_t> weights_, biases_;  // indices of tensors, by layer
+  std::vector<size_t> weights_, biases_, betas_;  // indices of tensors, by layer
 };
 
 }  // namespace metaekf::nn

@@ -1,6 +1,7 @@
 #include "core/nssm/model.h"
 
 #include <cmath>
+#include <numbers>
 
 #include "core/autodiff/scan.h"
 #include "core/base/status.h"
@@ -35,7 +36,7 @@ Model::Model(const ModelSpec& spec, std::optional<physics::Polyhedron> state_set
   const TransitionSpec& transition = spec.transition;
   const bool joint = transition.form == TransitionForm::kJoint && inputs > 0;
   if (!spec.fits_start()) {
-    encoder_ = nn::Block("encoder", spec.encoder, start_size() + (spec.is_case_one() ? 0 : inputs), latent, &layout_);
+    encoder_ = nn::Block("encoder", spec.encoder, EncodedStartSize() + (spec.is_case_one() ? 0 : inputs), latent, &layout_);
   }
   transition_ = nn::Block("transition", transition.block, latent + (joint ? inputs : 0), latent, &layout_);
   if (transition.form == TransitionForm::kAdditive && inputs > 0) {
@@ -66,6 +67,8 @@ int32_t Model::start_size() const {
   return spec_.is_case_one() ? spec_.window * (spec_.input_size + spec_.output_size) : spec_.state_size;
 }
 
+int32_t Model::EncodedStartSize() const { return start_size() + 2 * static_cast<int32_t>(spec_.angles.states.size()); }
+
 void Model::StartWithExactReconstruction(std::span<double> parameters) const {
   using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
   const auto weight = [&](const std::string& name) {
@@ -74,8 +77,11 @@ void Model::StartWithExactReconstruction(std::span<double> parameters) const {
     }
     return Eigen::Map<RowMajor>(nullptr, 0, 0);
   };
-  const Eigen::MatrixXd from_state = weight("encoder.0.weight").leftCols(spec_.state_size);
-  weight("state_decoder.0.weight") = linalg::SolveLeastSquares(from_state, Eigen::MatrixXd::Identity(from_state.rows(), from_state.rows()));
+  // Where there are latents enough, sines, cosines and inputs leave what is decoded alone.
+  const Eigen::MatrixXd encoder = weight("encoder.0.weight");
+  const Eigen::MatrixXd seen = encoder.cols() <= encoder.rows() ? encoder : Eigen::MatrixXd(encoder.leftCols(spec_.state_size));
+  const Eigen::MatrixXd inverse = linalg::SolveLeastSquares(seen, Eigen::MatrixXd::Identity(seen.rows(), seen.rows()));
+  weight("state_decoder.0.weight") = inverse.topRows(spec_.state_size);
 }
 
 std::vector<double> Model::InitialParameters(uint64_t seed) const {
@@ -105,7 +111,24 @@ std::vector<double> Model::InitialParameters(uint64_t seed) const {
   return parameters;
 }
 
+Value ModelGraph::WithAngles(Value state) const {
+  const AngleSpec& angles = model_.spec_.angles;
+  if (angles.states.empty()) return state;
+  std::vector<Value> rows = {state};
+  for (const int32_t i : angles.states) {
+    const bool has_units = angles.scale.size() > 0;
+    const int32_t cols = graph_->node(state).cols;
+    const Value from_mean = graph_->Scale(graph_->SliceRows(state, i, 1), has_units ? angles.scale[i] : 1);
+    const Value angle = graph_->Add(from_mean, graph_->Constant(has_units ? angles.mean[i] : 0, 1, cols));
+    rows.push_back(graph_->Apply(autodiff::Activation::kSine, 0, 0, angle));
+    // cos z = sin(z + π/2), which leaves all its derivatives to be taken.
+    rows.push_back(graph_->Apply(autodiff::Activation::kSine, 0, 0, graph_->Add(angle, graph_->Constant(std::numbers::pi / 2, 1, cols))));
+  }
+  return graph_->ConcatRows(rows);
+}
+
 Value ModelGraph::Encode(Value start, Value input) const {
+  if (!model_.spec_.is_case_one()) start = WithAngles(start);
   const bool with_input = !model_.spec_.is_case_one() && model_.spec_.input_size > 0;
   return with_input ? model_.encoder_.ApplyStacked(graph_, parameters_, start, input)
                     : model_.encoder_.Apply(graph_, parameters_, start);

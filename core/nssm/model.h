@@ -38,6 +38,8 @@ class Model {
  private:
   friend class ModelGraph;
   Model(const ModelSpec& spec, std::optional<physics::Polyhedron> state_set, std::optional<physics::Polyhedron> output_set);
+  /// Rows that the encoder sees besides u: the start, and in Case II sine and cosine of its angles.
+  int32_t EncodedStartSize() const;
   /// Linear 𝓔 and 𝓓x: 𝓓x starts as the pseudo-inverse of 𝓔 on x, so that a rollout through the state neither dies
   /// out nor explodes before anything is learned.
   void StartWithExactReconstruction(std::span<double> parameters) const;
@@ -67,6 +69,8 @@ class ModelGraph {
   autodiff::Value Output(autodiff::Value latent, autodiff::Value state) const;
 
  private:
+  autodiff::Value WithAngles(autodiff::Value state) const;
+
   const Model& model_;
   autodiff::Graph* graph_;
   nn::ParameterValues parameters_;

@@ -1,6 +1,7 @@
 #include "core/nssm/spec.h"
 
 #include <algorithm>
+#include <set>
 
 #include "core/base/status.h"
 
@@ -17,7 +18,8 @@ using Names = std::vector<std::pair<std::string, Enum>>;
 const Names<Activation> kActivations = {
     {"TANH", Activation::kTanh},   {"IDENTITY", Activation::kIdentity}, {"RELU", Activation::kRelu},
     {"LEAKY_RELU", Activation::kLeakyRelu}, {"ELU", Activation::kElu},  {"SELU", Activation::kSelu},
-    {"SWISH", Activation::kSwish}, {"MISH", Activation::kMish},         {"SOFTPLUS", Activation::kSoftplus}};
+    {"SWISH", Activation::kSwish}, {"MISH", Activation::kMish},         {"SOFTPLUS", Activation::kSoftplus},
+    {"SINE", Activation::kSine}};
 const Names<Case> kCases = {{"INPUT_OUTPUT", Case::kInputOutput}, {"STATE_INPUT_OUTPUT", Case::kStateInputOutput}};
 const std::vector<std::pair<std::string, StartMode>> kStarts = {{"ENCODED", StartMode::kEncoded},
                                                                    {"FITTED", StartMode::kFitted}};
@@ -39,13 +41,18 @@ std::string NameOf(const Names<Enum>& names, Enum value) {
 
 constexpr int32_t kLargestWidth = 1 << 16;
 constexpr double kLargeNumber = 1e12;
+constexpr double kSmallestBeta = 1e-3;  // of swish
 
 nn::BlockSpec ReadBlock(JsonFields* parent, const std::string& name) {
   JsonFields fields = parent->Object(name);
   nn::BlockSpec spec;
   spec.hidden_widths = fields.Integers("hidden_widths", 1, kLargestWidth);
   spec.activation = fields.Choice("activation", Activation::kTanh, kActivations);
-  spec.activation_parameter = fields.Number("activation_parameter", autodiff::DefaultParameter(spec.activation), 0, 1e3);
+  const bool swish = spec.activation == Activation::kSwish;
+  spec.activation_parameter =
+      fields.Number("activation_parameter", autodiff::DefaultParameter(spec.activation), swish ? kSmallestBeta : 0, 1e3);
+  spec.trained_beta = fields.Bool("trained_beta", false);
+  if (spec.trained_beta && !swish) fields.Fail("trained_beta", "only SWISH has a beta");
   spec.bias = !fields.Bool("no_bias", false);
   spec.output_scale = fields.Number("output_scale", 1, 0, 1e3);
   parent->Include(fields.Finish());
@@ -56,6 +63,7 @@ json BlockJson(const nn::BlockSpec& spec) {
   return {{"hidden_widths", spec.hidden_widths},
           {"activation", NameOf(kActivations, spec.activation)},
           {"activation_parameter", spec.activation_parameter},
+          {"trained_beta", spec.trained_beta},
           {"no_bias", !spec.bias},
           {"output_scale", spec.output_scale}};
 }
@@ -104,6 +112,18 @@ void ReadStateConstraint(JsonFields* parent, ModelSpec* spec) {
   JsonFields fields = parent->Object("state_constraint");
   spec->state_set = ReadPolyhedron(&fields, spec->state_size);
   parent->Include(fields.Finish());
+}
+
+void ReadAngles(JsonFields* fields, ModelSpec* spec) {
+  spec->angles.states = fields->Integers("angle_states", 0, kLargestWidth);
+  if (!spec->angles.states.empty() && spec->is_case_one()) fields->Fail("angle_states", "Case I (INPUT_OUTPUT) has no states");
+  std::set<int32_t> seen;
+  for (const int32_t state : spec->angles.states) {
+    if (spec->state_size != ModelSpec::kFromData && !spec->is_case_one() && state >= spec->state_size) {
+      fields->Fail("angle_states", absl::StrCat("state ", state, " does not exist: states count from 0 to ", spec->state_size - 1));
+    }
+    if (!seen.insert(state).second) fields->Fail("angle_states", absl::StrCat("state ", state, " stands there twice"));
+  }
 }
 
 void ReadConstraint(JsonFields* parent, ModelSpec* spec) {
@@ -169,6 +189,8 @@ absl::StatusOr<physics::Polyhedron> PolyhedronOf(const PolyhedronSpec& spec, int
 void TakeUnits(const data::Normaliser& normaliser, ModelSpec* spec) {
   spec->state_set.mean = normaliser.states.mean;
   spec->state_set.scale = normaliser.states.scale;
+  spec->angles.mean = normaliser.states.mean;
+  spec->angles.scale = normaliser.states.scale;
   spec->output_set.mean = normaliser.outputs.mean;
   spec->output_set.scale = normaliser.outputs.scale;
 }
@@ -198,6 +220,7 @@ absl::StatusOr<ModelSpec> ReadModelSpec(JsonFields fields) {
   spec.output_decoder = ReadBlock(&fields, "output_decoder");
   ReadConstraint(&fields, &spec);
   ReadStateConstraint(&fields, &spec);
+  ReadAngles(&fields, &spec);
   spec.precision = fields.Choice("precision", Precision::kFloat32, kPrecisions);
   if (!spec.is_case_one() && spec.transition.input_time == InputTime::kNext) {
     fields.Fail("transition.input_time", "NEXT is for Case I; in Case II the transition takes u_t, as the encoder does");
@@ -258,6 +281,7 @@ json ToJson(const ModelSpec& spec) {
     result["output_constraint"] = {{"curl_free", {{"position_states", spec.curl_free_positions}}}};
   }
   if (!spec.output_set.empty()) result["output_constraint"] = PolyhedronJson(spec.output_set);
+  if (!spec.angles.states.empty()) result["angle_states"] = spec.angles.states;
   if (!spec.state_set.empty()) result["state_constraint"] = PolyhedronJson(spec.state_set);
   return result;
 }

@@ -45,6 +45,13 @@ struct PolyhedronSpec {
 /// Errors: InvalidArgument if the numbers are no whole rows of n, or those of physics::MakePolyhedron.
 absl::StatusOr<physics::Polyhedron> PolyhedronOf(const PolyhedronSpec& spec, int32_t size);
 
+/// States that are angles in rad: `angle_states` of the message ModelSpec.
+struct AngleSpec {
+  std::vector<int32_t> states;
+  /// What stands between rad and the model's units, of all states, of a model that has a normaliser; not part of the message.
+  Eigen::VectorXd mean, scale;
+};
+
 /// What a model is: the message ModelSpec of spec.proto, where each field is described.
 struct ModelSpec {
   static constexpr int32_t kFromData = -1;
@@ -60,6 +67,7 @@ struct ModelSpec {
   nn::BlockSpec state_decoder;
   nn::BlockSpec output_decoder;
   std::vector<int32_t> curl_free_positions;  ///< not empty: 𝓟y is the gradient with respect to these states
+  AngleSpec angles;
   PolyhedronSpec state_set, output_set;  ///< 𝓟x of Case II, 𝓟y; empty: none
   Precision precision = Precision::kFloat32;
   StartMode start = StartMode::kEncoded;

@@ -97,6 +97,8 @@ T Apply(Activation activation, T a, T z) {
       return Mish<order>(z);
     case Activation::kSoftplus:
       return SoftplusDerivative<order>(z);
+    case Activation::kSine:
+      return order == 0 ? std::sin(z) : order == 1 ? std::cos(z) : order == 2 ? -std::sin(z) : -std::cos(z);
     default:
       return order == 0 ? z : kConstant;
   }

@@ -227,7 +227,7 @@ TEST(EmpiricalBayesTest, OneRoundOnALinearFamilyIsItsClosedForm) {
   for (uint64_t seed = 0; seed < 7; ++seed) systems.training.push_back(nssm::RandomTrajectory(spec.model, 60, 20 + seed));
   base::Executor* const executor = base::CallingThread();
   TrainingState state;
-  const absl::StatusOr<LearnedPrior> learned = LearnGaussianPrior(spec, model, mask, systems, executor, &state, nullptr);
+  const absl::StatusOr<LearnedPrior> learned = LearnGaussianPrior(spec, model, mask, systems, {}, executor, &state, nullptr);
   ASSERT_TRUE(learned.ok()) << learned.status();
 
   const FitPlan plan(model, spec.loss, mask);
@@ -280,7 +280,7 @@ TEST(EmpiricalBayesTest, WhatDoesNotAdaptStaysAsInTheFirstFit) {
   base::Executor* const executor = base::CallingThread();
   TrainingState state;
   const absl::StatusOr<LearnedPrior> learned =
-      LearnGaussianPrior(spec, model, mask, systems, executor, &state, nullptr);
+      LearnGaussianPrior(spec, model, mask, systems, {}, executor, &state, nullptr);
   ASSERT_TRUE(learned.ok()) << learned.status();
   const GaussianPriorSpec& options = spec.gaussian_prior;
   const absl::StatusOr<SystemFit> first =

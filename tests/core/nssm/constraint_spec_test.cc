@@ -43,6 +43,22 @@ TEST(ConstraintSpecTest, WhatIsWrongIsNamed) {
               HasSubstr("model.state_constraint"));
 }
 
+TEST(SpecTest, OnlySwishHasABetaAndItIsPositive) {
+  const auto message = [](const json& decoder) { return std::string(Read({{"output_decoder", decoder}}).status().message()); };
+  EXPECT_EQ(message({{"hidden_widths", {3}}, {"activation", "SWISH"}, {"activation_parameter", 0.5}, {"trained_beta", true}}), "");
+  EXPECT_THAT(message({{"hidden_widths", {3}}, {"activation", "TANH"}, {"trained_beta", true}}), HasSubstr("model.output_decoder.trained_beta"));
+  EXPECT_THAT(message({{"hidden_widths", {3}}, {"activation", "SWISH"}, {"activation_parameter", 0}}), HasSubstr("model.output_decoder.activation_parameter"));
+}
+
+TEST(SpecTest, AnglesAreStatesThatExist) {
+  const auto message = [](const json& angles) { return std::string(Read({{"angle_states", angles}}).status().message()); };
+  EXPECT_EQ(message({1}), "");
+  EXPECT_EQ(ToJson(*Read({{"angle_states", {1}}}))["angle_states"], json({1}));
+  EXPECT_THAT(message({2}), HasSubstr("angle_states: state 2 does not exist"));
+  EXPECT_THAT(message({0, 0}), HasSubstr("state 0 stands there twice"));
+  EXPECT_THAT(std::string(Read({{"case", "INPUT_OUTPUT"}, {"state_size", 0}, {"angle_states", {0}}}).status().message()), HasSubstr("angle_states"));
+}
+
 // A file gives the layer its units back: the same parameters give the same predictions.
 TEST(ConstraintSpecTest, AModelFileKeepsTheConstraint) {
   for (const ModelCase& c : ModelCases()) {

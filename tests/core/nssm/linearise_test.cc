@@ -2,7 +2,11 @@
 
 #include <gtest/gtest.h>
 
+#include <cmath>
+#include <numbers>
+
 #include "tests/core/nssm/random_models.h"
+#include "tests/support/bundles.h"
 
 namespace metaekf::nssm {
 namespace {
@@ -73,6 +77,24 @@ TEST(LineariseTest, RolloutSensitivitiesMatchCentralDifferencesForEveryKindOfMod
       const VectorXd slope = (outputs_at(parameters, up) - outputs_at(parameters, down)) / (2 * kStep);
       EXPECT_LT((s.carry.col(i) - slope).norm(), 1e-6 * (1 + s.carry.norm())) << i;
     }
+  }
+}
+
+// The normaliser stands between the model and rad.
+TEST(LineariseTest, AnAngleIsSeenBySineAndCosine) {
+  ModelSpec spec{.kind = Case::kStateInputOutput, .input_size = 1, .output_size = 2, .state_size = 2, .latent_size = 2, .window = 1};
+  spec.precision = Precision::kFloat64;
+  spec.angles.states = {1};
+  const double mean = 0.4, scale = 1.5;
+  TakeUnits({.states = {Eigen::Vector2d(3, mean), Eigen::Vector2d(2, scale)}}, &spec);
+  Bundle bundle = support::UnitBundle(*Model::Create(spec));
+  support::SetWeight("encoder.0.weight", Eigen::MatrixXd{{0, 0, 1, 0, 0}, {0, 0, 0, 1, 0}}, &bundle);  // x1, x2, sin, cos, u
+  support::SetWeight("output_decoder.0.weight", Eigen::Matrix2d::Identity(), &bundle);
+  for (const double angle : {0.7, 0.7 + 2 * std::numbers::pi, -2.0}) {
+    const Eigen::Vector2d state(0.2, (angle - mean) / scale);
+    const Linearisation at = Linearise(bundle.model, bundle.parameters, state, Eigen::VectorXd::Ones(1));
+    EXPECT_NEAR((at.h - Eigen::Vector2d(std::sin(angle), std::cos(angle))).norm(), 0, 1e-14);
+    EXPECT_NEAR((at.C - Eigen::Matrix2d{{0, scale * std::cos(angle)}, {0, -scale * std::sin(angle)}}).norm(), 0, 1e-14);
   }
 }
 

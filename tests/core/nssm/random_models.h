@@ -38,6 +38,15 @@ inline std::vector<ModelCase> ModelCases() {
   curl.output_decoder = block({3}, Activation::kSwish);
   curl.curl_free_positions = {1, 0};
 
+  ModelSpec beta = curl;
+  beta.encoder = beta.output_decoder = block({4, 3}, Activation::kSwish);
+  beta.encoder.activation_parameter = 1.7;  // fixed
+  beta.output_decoder.activation_parameter = 0.6;
+  beta.output_decoder.trained_beta = true;
+
+  ModelSpec angle = curl;
+  angle.angles = {.states = {1}, .mean = Eigen::Vector2d(0.3, 0.4), .scale = Eigen::Vector2d(1, 1.5)};
+
   const LossSpec latent{.horizon = 3, .rollout = RolloutMode::kLatent, .state_weight = 0, .reconstruction_weight = 0.5};
   const LossSpec state{.horizon = 3, .rollout = RolloutMode::kState, .stride = 2, .state_weight = 0.7, .reconstruction_weight = 1.3};
   std::vector<ModelCase> cases;
@@ -72,6 +81,8 @@ inline std::vector<ModelCase> ModelCases() {
   cases.push_back({"Case II, one step", two, one_step});
   cases.push_back({"curl-free, one step", curl, one_step});
   cases.push_back({"curl-free, three steps", curl, state});
+  cases.push_back({"curl-free, a state is an angle", angle, state});
+  cases.push_back({"curl-free, swish with fixed and trained beta", beta, state});
   LossSpec whole = latent;
   whole.horizon = LossSpec::kWholeSet;
   cases.push_back({"Case I, whole set", one, whole});

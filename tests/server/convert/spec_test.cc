@@ -74,6 +74,12 @@ v1::TrainingSpec FullSpec() {
   model.mutable_output_constraint()->mutable_curl_free()->add_position_states(0);  // instead of a polyhedron
   model.mutable_output_constraint()->mutable_curl_free()->add_position_states(1);
   model.set_output_size(2);  // as many as positions
+  model.clear_angle_states();
+  model.add_angle_states(2);  // one that there is
+  for (v1::BlockSpec* block : {model.mutable_encoder(), model.mutable_transition()->mutable_block(), model.mutable_state_decoder(),
+                               model.mutable_output_decoder()}) {
+    block->set_activation(v1::BlockSpec::SWISH);  // the only one with a beta
+  }
   auto* polyhedron = model.mutable_state_constraint()->mutable_polyhedron();
   polyhedron->clear_rays();  // stand instead of the others
   while (polyhedron->matrix_size() < static_cast<int>(model.state_size())) polyhedron->add_matrix(-1);  // whole rows
