@@ -1,11 +1,9 @@
 #include "core/experiments/bouc_wen_learners.h"
 
 #include <algorithm>
-#include <chrono>
 
 #include "absl/strings/str_cat.h"
 #include "core/base/status.h"
-#include "core/experiments/jobs.h"
 #include "core/meta/adapt.h"
 #include "core/meta/fit_plan.h"
 #include "core/meta/scratch_fit.h"
@@ -149,29 +147,6 @@ absl::StatusOr<SystemModel> FitFromScratch(const Learner& like, const data::Traj
   METAEKF_ASSIGN_OR_RETURN(meta::AdaptationResult result, meta::Adapt(bundle, context, options, nullptr));
   bundle.parameters = std::move(result.parameters);
   return ModelOf(bundle);
-}
-
-absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learners, const data::Dataset& fleet,
-                                               const data::Trajectory& context, uint64_t seed, base::Executor* executor,
-                                               const OnProgress& on_progress) {
-  using Clock = std::chrono::steady_clock;
-  std::vector<Training> trainings;
-  for (const Learner& learner : learners) {
-    const auto tell = [&](int32_t iteration, int32_t iterations) {
-      const std::string what = absl::StrCat("training ", learner.label, " (", trainings.size() + 1, " of ", learners.size(), ")");
-      return !on_progress || on_progress(static_cast<size_t>(iteration), static_cast<size_t>(iterations), what);
-    };
-    const PeakMemory memory;
-    const Clock::time_point begin = Clock::now();
-    absl::StatusOr<nssm::Bundle> bundle =
-        TrainLearner(learner, fleet, context, seed, executor, [&tell](const meta::TrainingProgress& step) {
-          return tell(step.state.iteration, step.iterations);
-        });
-    if (!bundle.ok() && !IsDivergence(bundle.status())) return bundle.status();
-    const double seconds = std::chrono::duration<double>(Clock::now() - begin).count();
-    trainings.push_back({std::move(bundle), seconds, memory.MiB()});
-  }
-  return trainings;
 }
 
 }  // namespace metaekf::experiments

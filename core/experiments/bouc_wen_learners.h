@@ -23,17 +23,4 @@ Learner PrintedMaml(Budget budget);
 /// Errors: those of meta::FitFromScratch or meta::Adapt.
 absl::StatusOr<SystemModel> FitFromScratch(const Learner& like, const data::Trajectory& context, uint64_t seed);
 
-/// What a training has brought, and what it took.
-struct Training {
-  absl::StatusOr<nssm::Bundle> bundle;  ///< OutOfRange if it diverged
-  double seconds = 0;     ///< on the wall
-  double memory_mib = 0;  ///< at its peak
-};
-
-/// Trains every learner on the fleet, one after the other with all threads. One that diverges does not stop the others.
-/// @param context  of the target, for learners that train on it too.
-absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learners, const data::Dataset& fleet,
-                                               const data::Trajectory& context, uint64_t seed, base::Executor* executor,
-                                               const OnProgress& on_progress);
-
 }  // namespace metaekf::experiments

@@ -1,11 +1,13 @@
 #include "core/experiments/learner.h"
 
 #include <algorithm>
+#include <chrono>
 #include <memory>
 #include <utility>
 
 #include "core/base/status.h"
 #include "core/data/split.h"
+#include "core/experiments/jobs.h"
 #include "core/meta/adapt.h"
 
 namespace metaekf::experiments {
@@ -57,6 +59,29 @@ absl::StatusOr<nssm::Bundle> TrainLearner(const Learner& learner, const data::Da
   absl::StatusOr<nssm::Bundle> bundle = meta::Train(spec, data, nullptr, executor, on_step);
   if (!bundle.ok()) return base::Annotate(bundle.status(), learner.label);
   return bundle;
+}
+
+absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learners, const data::Dataset& fleet,
+                                               const data::Trajectory& context, uint64_t seed, base::Executor* executor,
+                                               const OnProgress& on_progress) {
+  using Clock = std::chrono::steady_clock;
+  std::vector<Training> trainings;
+  for (const Learner& learner : learners) {
+    const auto tell = [&](int32_t iteration, int32_t iterations) {
+      const std::string what = absl::StrCat("training ", learner.label, " (", trainings.size() + 1, " of ", learners.size(), ")");
+      return !on_progress || on_progress(static_cast<size_t>(iteration), static_cast<size_t>(iterations), what);
+    };
+    const PeakMemory memory;
+    const Clock::time_point begin = Clock::now();
+    absl::StatusOr<nssm::Bundle> bundle =
+        TrainLearner(learner, fleet, context, seed, executor, [&tell](const meta::TrainingProgress& step) {
+          return tell(step.state.iteration, step.iterations);
+        });
+    if (!bundle.ok() && !IsDivergence(bundle.status())) return bundle.status();
+    const double seconds = std::chrono::duration<double>(Clock::now() - begin).count();
+    trainings.push_back({std::move(bundle), seconds, memory.MiB()});
+  }
+  return trainings;
 }
 
 SystemModel ModelOf(const nssm::Bundle& bundle) {

@@ -3,10 +3,12 @@
 #include <functional>
 #include <nlohmann/json.hpp>
 #include <string>
+#include <vector>
 
 #include "absl/status/statusor.h"
 #include "core/base/executor.h"
 #include "core/data/trajectory.h"
+#include "core/experiments/experiment.h"
 #include "core/meta/train.h"
 #include "core/nssm/predict.h"
 
@@ -29,6 +31,19 @@ nlohmann::json ToJson(const Learner& learner);
 /// Errors: those of meta::Train, beginning with the label.
 absl::StatusOr<nssm::Bundle> TrainLearner(const Learner& learner, const data::Dataset& fleet, const data::Trajectory& context,
                                           uint64_t seed, base::Executor* executor, const meta::OnTrainingStep& on_step = nullptr);
+
+/// What a training has brought, and what it took.
+struct Training {
+  absl::StatusOr<nssm::Bundle> bundle;  ///< OutOfRange if it diverged
+  double seconds = 0;     ///< on the wall
+  double memory_mib = 0;  ///< at its peak
+};
+
+/// Trains every learner on the fleet, one after the other with all threads. One that diverges does not stop the others.
+/// @param context  of the target, for learners that train on it too.
+absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learners, const data::Dataset& fleet,
+                                               const data::Trajectory& context, uint64_t seed, base::Executor* executor,
+                                               const OnProgress& on_progress);
 
 /// A model of one system, neural or not.
 struct SystemModel {

@@ -16,4 +16,7 @@ Experiment AnilHeatmap();
 /// How good models of new Bouc–Wen oscillators are, against the length of their contexts. Beyond the paper.
 Experiment FewShotCurve();
 
+/// Vehicles that find their position by an unknown magnetic field (paper.tex sec. localization).
+Experiment Localization();
+
 }  // namespace metaekf::experiments

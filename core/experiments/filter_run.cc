@@ -1,0 +1,47 @@
+#include "core/experiments/filter_run.h"
+
+#include <memory>
+#include <utility>
+
+#include "core/base/status.h"
+#include "core/experiments/jobs.h"
+
+namespace metaekf::experiments {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const data::Trajectory& recording, int64_t from,
+                                             filter::FilterOptions options) {
+  const std::shared_ptr<const filter::FilterModel> functions = filter::FilterModel::Create(model);
+  const std::shared_ptr<const filter::FilterModel::Parameters> parameters = functions->Prepare(model.parameters);
+  const std::unique_ptr<filter::FilterModel::Scratch> scratch = functions->MakeScratch();
+  const data::Normaliser& units = model.normaliser;
+  const Index n = units.states.scale.size(), count = recording.length() - from;
+  VectorXd first(n);
+  MatrixXd F(n, n);
+  functions->Transition(*parameters, units.states.Normalise(recording.states.col(from - 1)),
+                        units.inputs.Normalise(recording.inputs.col(from - 1)), &first, &F, scratch.get());
+  options.initial_mean = first.cwiseProduct(units.states.scale) + units.states.mean;
+  options.initial_cov = options.process_cov.value_or(model.noise.process);
+  METAEKF_ASSIGN_OR_RETURN(filter::Ekf ekf, filter::Ekf::Create(model, functions, parameters, options));
+  filter::Estimate estimate = ekf.MakeEstimate();
+  FilterRun run{.means = MatrixXd(n, count), .deviations = MatrixXd(n, count), .nis = VectorXd(count)};
+  const double begin = ThreadSeconds();
+  for (Index t = 0; t < count; ++t) {
+    METAEKF_RETURN_IF_ERROR(ekf.Step(recording.inputs.col(from + t), recording.outputs.col(from + t), scratch.get(), &estimate));
+    run.means.col(t) = estimate.mean;
+    run.deviations.col(t) = estimate.cov.diagonal().cwiseSqrt();
+    run.nis[t] = estimate.nis;
+    run.health.push_back(estimate.health);
+  }
+  run.seconds_per_step = (ThreadSeconds() - begin) / static_cast<double>(count);
+  return run;
+}
+
+double Coverage(const FilterRun& run, const MatrixXd& errors, double width) {
+  return (errors.array().abs() <= width * run.deviations.array()).cast<double>().mean();
+}
+
+}  // namespace metaekf::experiments

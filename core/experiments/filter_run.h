@@ -1,0 +1,32 @@
+#pragma once
+
+#include <vector>
+
+#include "absl/status/statusor.h"
+#include "core/data/trajectory.h"
+#include "core/filter/ekf.h"
+#include "core/nssm/bundle.h"
+
+namespace metaekf::experiments {
+
+/// What an EKF has said of a recording, a column per sample. Physical units.
+struct FilterRun {
+  Eigen::MatrixXd means, deviations;  ///< of every state, after the sample's measurement
+  Eigen::VectorXd nis;
+  std::vector<filter::Health> health;
+  double seconds_per_step = 0;  ///< of the processor
+};
+
+/// Estimates the states of a model of Case II in `recording` from sample `from` on, where the samples before are the context, whose
+/// states were measured: the filter begins there with x⁻ = f(x_{from−1}, u_{from−1}) and P⁻ = Q.
+///
+/// @param model  with the parameters and the noise that the filter is to use. @param recording  n_x states and T samples.
+/// @param from  at least 1. @param options  of the filter, without its beginning.
+/// Errors: those of filter::Ekf.
+absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const data::Trajectory& recording, int64_t from,
+                                             filter::FilterOptions options = {});
+
+/// Share of the errors that bounds of ± `width` standard deviations hold. @param errors  of the means.
+double Coverage(const FilterRun& run, const Eigen::MatrixXd& errors, double width);
+
+}  // namespace metaekf::experiments
