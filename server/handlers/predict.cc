@@ -1,14 +1,12 @@
 #include "core/nssm/predict.h"
 
 #include <algorithm>
-#include <optional>
 #include <utility>
 
 #include "absl/strings/str_cat.h"
 #include "core/base/status.h"
-#include "server/convert/samples.h"
 #include "server/handlers/prediction_handlers.h"
-#include "server/status/details.h"
+#include "server/handlers/trajectory_call.h"
 
 namespace metaekf::server {
 namespace {
@@ -25,50 +23,24 @@ void Append(const Eigen::MatrixXd& values, Eigen::Index first, Eigen::Index coun
   field->Add(begin, begin + count * values.rows());
 }
 
-class PredictCall final : public StreamHandler<Request, Response> {
+class PredictCall final : public TrajectoryCall<Request, Response> {
  public:
-  explicit PredictCall(const ServiceContext& context) : context_(context) {}
-
-  absl::Status OnRequest(Request& request, Sink& sink) override {
-    if (!assembler_) {
-      if (!request.has_header()) return FieldViolation("header", "must be the first message");
-      return TakeHeader(request.header());
-    }
-    if (!request.has_samples()) {
-      return FieldViolation("samples", "are missing: after the header come samples only");
-    }
-    METAEKF_ASSIGN_OR_RETURN(const auto complete, assembler_->Add(request.samples()));
-    return complete ? PredictTrajectory(*complete, sink) : absl::OkStatus();
-  }
-
-  absl::Status OnEnd(Sink& sink) override {
-    if (!assembler_) return FieldViolation("header", "is missing");
-    const std::optional<data::Trajectory> last = assembler_->Finish();
-    if (!last) return FieldViolation("samples", "there are none");
-    return PredictTrajectory(*last, sink);
-  }
+  using TrajectoryCall::TrajectoryCall;
 
  private:
-  absl::Status TakeHeader(const Request::Header& header) {
+  absl::Status TakeHeader(const Request::Header& header) override {
     if (header.mode() != Request::ONE_STEP && header.mode() != Request::SIMULATE) {
       return FieldViolation("header.mode", "say ONE_STEP or SIMULATE");
     }
     mode_ = header.mode() == Request::ONE_STEP ? nssm::PredictionMode::kOneStep
                                                : nssm::PredictionMode::kSimulate;
-    METAEKF_ASSIGN_OR_RETURN(model_, context_.models.Get("header.target", header.target()));
-    METAEKF_ASSIGN_OR_RETURN(const ChannelCounts channels,
-                             MatchChannels("header.channels", header.channels(), model_->bundle));
-    assembler_.emplace(SampleRules{.channels = channels,
-                                   .missing_measurements = true,
-                                   .sample_period_s = model_->bundle.sample_period_s,
-                                   .max_samples = context_.options.limits.samples_per_call});
     return absl::OkStatus();
   }
 
-  absl::Status PredictTrajectory(const data::Trajectory& trajectory, Sink& sink) const {
+  absl::Status Answer(const data::Trajectory& trajectory, Sink& sink) override {
     METAEKF_RETURN_IF_ERROR(CheckStart(trajectory));
     METAEKF_ASSIGN_OR_RETURN(const nssm::Prediction prediction,
-                             nssm::Predict(model_->bundle, trajectory, mode_));
+                             nssm::Predict(model().bundle, trajectory, mode_));
     const Eigen::Index width =
         std::max<Eigen::Index>(1, prediction.outputs.rows() + prediction.states.rows());
     const Eigen::Index rows = std::max<Eigen::Index>(1, kValuesPerResponse / width);
@@ -88,7 +60,7 @@ class PredictCall final : public StreamHandler<Request, Response> {
 
   /// A free run has nothing but the start to go by, so all of that must be measured.
   absl::Status CheckStart(const data::Trajectory& trajectory) const {
-    const nssm::ModelSpec& spec = model_->bundle.model.spec();
+    const nssm::ModelSpec& spec = model().bundle.model.spec();
     const Eigen::MatrixXd& measured = spec.is_case_one() ? trajectory.outputs : trajectory.states;
     const Eigen::Index needed = std::min<Eigen::Index>(spec.warmup(), measured.cols());
     if (mode_ != nssm::PredictionMode::kSimulate || measured.leftCols(needed).allFinite()) {
@@ -99,10 +71,7 @@ class PredictCall final : public StreamHandler<Request, Response> {
                                        "first ", spec.warmup(), " measured"));
   }
 
-  const ServiceContext& context_;
   nssm::PredictionMode mode_ = nssm::PredictionMode::kOneStep;
-  std::shared_ptr<const ServedModel> model_;
-  std::optional<TrajectoryAssembler> assembler_;  // once the header is there
 };
 
 }  // namespace

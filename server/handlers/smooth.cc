@@ -7,11 +7,10 @@
 
 #include "absl/strings/str_cat.h"
 #include "core/base/status.h"
-#include "server/convert/samples.h"
 #include "server/handlers/smoothing_handlers.h"
+#include "server/handlers/trajectory_call.h"
 #include "server/session/read_options.h"
 #include "server/session/write_estimate.h"
-#include "server/status/details.h"
 
 namespace metaekf::server {
 namespace {
@@ -22,54 +21,29 @@ using Sink = ResponseSink<Response>;
 
 constexpr size_t kValuesPerResponse = 16'384;
 
-class SmoothCall final : public StreamHandler<Request, Response> {
+class SmoothCall final : public TrajectoryCall<Request, Response> {
  public:
-  explicit SmoothCall(const ServiceContext& context) : context_(context) {}
-
-  absl::Status OnRequest(Request& request, Sink& sink) override {
-    if (!assembler_) {
-      if (!request.has_header()) return FieldViolation("header", "must be the first message");
-      return TakeHeader(request.header());
-    }
-    if (!request.has_samples()) {
-      return FieldViolation("samples", "are missing: after the header come samples only");
-    }
-    METAEKF_ASSIGN_OR_RETURN(const auto complete, assembler_->Add(request.samples()));
-    return complete ? SmoothTrajectory(*complete, sink) : absl::OkStatus();
-  }
-
-  absl::Status OnEnd(Sink& sink) override {
-    if (!assembler_) return FieldViolation("header", "is missing");
-    const std::optional<data::Trajectory> last = assembler_->Finish();
-    if (!last) return FieldViolation("samples", "there are none");
-    return SmoothTrajectory(*last, sink);
-  }
+  using TrajectoryCall::TrajectoryCall;
 
  private:
-  absl::Status TakeHeader(const Request::Header& header) {
-    METAEKF_ASSIGN_OR_RETURN(model_, context_.models.Get("header.target", header.target()));
-    const nssm::Bundle& bundle = model_->bundle;
-    METAEKF_ASSIGN_OR_RETURN(ChannelCounts channels, MatchChannels("header.channels", header.channels(), bundle));
+  absl::Status TakeHeader(const Request::Header& header) override {
+    const nssm::Bundle& bundle = model().bundle;
     METAEKF_ASSIGN_OR_RETURN(const filter::FilterOptions options,
-                             ReadFilterOptions("header", header, model_->filter_model->state_size(),
+                             ReadFilterOptions("header", header, model().filter_model->state_size(),
                                                bundle.model.spec().output_size));
     absl::StatusOr<filter::Ekf> ekf =
-        filter::Ekf::Create(bundle, model_->filter_model, model_->filter_parameters, options);
+        filter::Ekf::Create(bundle, model().filter_model, model().filter_parameters, options);
     if (!ekf.ok()) return FieldViolation("header.noise", std::string(ekf.status().message()));
     ekf_ = *std::move(ekf);
     format_ = {.covariance = header.covariance_format() == v1::OpenSession::COVARIANCE_FORMAT_UNSPECIFIED
                                  ? v1::OpenSession::NONE
                                  : header.covariance_format(),
                .constrained = ekf_->constrained()};
-    assembler_.emplace(SampleRules{.channels = channels,
-                                   .missing_measurements = true,
-                                   .sample_period_s = bundle.sample_period_s,
-                                   .max_samples = context_.options.limits.samples_per_call});
     return absl::OkStatus();
   }
 
-  absl::Status SmoothTrajectory(const data::Trajectory& trajectory, Sink& sink) {
-    const auto scratch = model_->filter_model->MakeScratch();
+  absl::Status Answer(const data::Trajectory& trajectory, Sink& sink) override {
+    const auto scratch = model().filter_model->MakeScratch();
     const auto estimates = filter::Smooth(*ekf_, trajectory, scratch.get());
     if (!estimates.ok()) {
       return FieldViolation("samples", absl::StrCat("trajectory '", trajectory.name, "': ", estimates.status().message()));
@@ -83,7 +57,7 @@ class SmoothCall final : public StreamHandler<Request, Response> {
       for (size_t t = first; t < std::min(first + rows, estimates->size()); ++t) {
         const Eigen::Index sample = static_cast<Eigen::Index>(t);
         const uint32_t flags = trajectory.outputs.col(sample).hasNaN() ? v1::EstimateBatch::MISSING : 0;
-        WriteEstimate(format_, trajectory.start_s + static_cast<double>(t) * model_->bundle.sample_period_s, (*estimates)[t],
+        WriteEstimate(format_, trajectory.start_s + static_cast<double>(t) * model().bundle.sample_period_s, (*estimates)[t],
                       flags, response.mutable_estimates());
       }
       if (first == 0) Introduce(&response);
@@ -93,18 +67,15 @@ class SmoothCall final : public StreamHandler<Request, Response> {
   }
 
   void Introduce(Response* response) const {
-    const nssm::Bundle& bundle = model_->bundle;
+    const nssm::Bundle& bundle = model().bundle;
     for (const std::string& name : bundle.model.spec().is_case_one() ? bundle.names.outputs : bundle.names.states) {
       response->add_estimated()->set_name(name);
     }
     response->set_constrained(format_.constrained);
   }
 
-  const ServiceContext& context_;
-  std::shared_ptr<const ServedModel> model_;
   std::optional<filter::Ekf> ekf_;  // that has applied nothing
   EstimateFormat format_;
-  std::optional<TrajectoryAssembler> assembler_;  // once the header is there
 };
 
 }  // namespace

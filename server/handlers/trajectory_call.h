@@ -1,0 +1,67 @@
+#pragma once
+
+#include <memory>
+#include <optional>
+
+#include "absl/status/status.h"
+#include "absl/status/statusor.h"
+#include "core/base/status.h"
+#include "server/convert/samples.h"
+#include "server/handlers/service_context.h"
+#include "server/handlers/stream_handler.h"
+#include "server/status/details.h"
+
+namespace metaekf::server {
+
+/// A call that brings recordings to a model or adaptation: a header first, then samples, a trajectory worked on when it is complete.
+template <class Request, class Response>
+class TrajectoryCall : public StreamHandler<Request, Response> {
+ public:
+  explicit TrajectoryCall(const ServiceContext& context) : context_(context) {}
+
+  absl::Status OnRequest(Request& request, ResponseSink<Response>& sink) final {
+    if (!assembler_) {
+      if (!request.has_header()) return FieldViolation("header", "must be the first message");
+      return Open(request.header());
+    }
+    if (!request.has_samples()) {
+      return FieldViolation("samples", "are missing: after the header come samples only");
+    }
+    METAEKF_ASSIGN_OR_RETURN(const auto complete, assembler_->Add(request.samples()));
+    return complete ? Answer(*complete, sink) : absl::OkStatus();
+  }
+
+  absl::Status OnEnd(ResponseSink<Response>& sink) final {
+    if (!assembler_) return FieldViolation("header", "is missing");
+    const std::optional<data::Trajectory> last = assembler_->Finish();
+    if (!last) return FieldViolation("samples", "there are none");
+    return Answer(*last, sink);
+  }
+
+ protected:
+  using Header = typename Request::Header;
+
+  /// What the header says beyond target and channels, which are known when this is called.
+  virtual absl::Status TakeHeader(const Header& header) = 0;
+  virtual absl::Status Answer(const data::Trajectory& trajectory, ResponseSink<Response>& sink) = 0;
+
+  const ServedModel& model() const { return *model_; }
+
+ private:
+  absl::Status Open(const Header& header) {
+    METAEKF_ASSIGN_OR_RETURN(model_, context_.models.Get("header.target", header.target()));
+    METAEKF_ASSIGN_OR_RETURN(const ChannelCounts channels, MatchChannels("header.channels", header.channels(), model_->bundle));
+    METAEKF_RETURN_IF_ERROR(TakeHeader(header));
+    assembler_.emplace(SampleRules{.channels = channels,
+                                   .missing_measurements = true,
+                                   .sample_period_s = model_->bundle.sample_period_s,
+                                   .max_samples = context_.options.limits.samples_per_call});
+    return absl::OkStatus();
+  }
+
+  const ServiceContext& context_;
+  std::shared_ptr<const ServedModel> model_;
+  std::optional<TrajectoryAssembler> assembler_;  // once the header is there
+};
+
+}  // namespace metaekf::server
