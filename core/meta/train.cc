@@ -20,8 +20,6 @@ namespace {
 using data::Dataset;
 using data::Trajectory;
 using nssm::Bundle;
-
-
 using nssm::ModelSpec;
 
 constexpr size_t kNoiseSystems = 8;    // systems whose residuals give the default covariances, at most

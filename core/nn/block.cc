@@ -27,7 +27,7 @@ Value Block::AddBias(Graph* graph, const ParameterValues& parameters, size_t lay
 }
 
 Value Block::Activate(Graph* graph, const ParameterValues& parameters, size_t layer, Value z) const {
-  const double beta = spec_.activation_parameter;
+  const double beta = spec_.Beta();
   if (spec_.activation != Activation::kSwish || (beta == 1 && !spec_.trained_beta)) {
     return graph->Apply(spec_.activation, spec_.activation_parameter, 0, z);
   }
@@ -73,7 +73,7 @@ void Block::Initialise(const ParameterLayout& layout, base::Rng* rng, std::span<
   }
   for (const size_t beta : betas_) {
     const Tensor& tensor = layout.tensors()[beta];
-    std::fill_n(parameters.begin() + tensor.offset, tensor.size(), spec_.activation_parameter);
+    std::fill_n(parameters.begin() + tensor.offset, tensor.size(), spec_.Beta());
   }
 }
 

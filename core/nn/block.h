@@ -14,10 +14,12 @@ namespace metaekf::nn {
 struct BlockSpec {
   std::vector<int32_t> hidden_widths;  ///< none: a single linear map
   autodiff::Activation activation = autodiff::Activation::kTanh;
-  double activation_parameter = 0;  ///< slope of the leaky ReLU, α of the ELU, β of swish
+  double activation_parameter = 0;  ///< slope of the leaky ReLU, α of the ELU, β of swish (0: 1)
   bool trained_beta = false;        ///< of swish: every hidden unit has a β of its own, which begins as activation_parameter
   bool bias = true;
   double output_scale = 1;  ///< factor on the last layer's initial weights
+
+  double Beta() const { return activation_parameter > 0 ? activation_parameter : 1; }
 };
 
 /// z ← W_l z + b_l, with σ after every layer but the last.

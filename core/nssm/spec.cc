@@ -41,18 +41,15 @@ std::string NameOf(const Names<Enum>& names, Enum value) {
 
 constexpr int32_t kLargestWidth = 1 << 16;
 constexpr double kLargeNumber = 1e12;
-constexpr double kSmallestBeta = 1e-3;  // of swish
 
 nn::BlockSpec ReadBlock(JsonFields* parent, const std::string& name) {
   JsonFields fields = parent->Object(name);
   nn::BlockSpec spec;
   spec.hidden_widths = fields.Integers("hidden_widths", 1, kLargestWidth);
   spec.activation = fields.Choice("activation", Activation::kTanh, kActivations);
-  const bool swish = spec.activation == Activation::kSwish;
-  spec.activation_parameter =
-      fields.Number("activation_parameter", autodiff::DefaultParameter(spec.activation), swish ? kSmallestBeta : 0, 1e3);
+  spec.activation_parameter = fields.Number("activation_parameter", autodiff::DefaultParameter(spec.activation), 0, 1e3);
   spec.trained_beta = fields.Bool("trained_beta", false);
-  if (spec.trained_beta && !swish) fields.Fail("trained_beta", "only SWISH has a beta");
+  if (spec.trained_beta && spec.activation != Activation::kSwish) fields.Fail("trained_beta", "only SWISH has a beta");
   spec.bias = !fields.Bool("no_bias", false);
   spec.output_scale = fields.Number("output_scale", 1, 0, 1e3);
   parent->Include(fields.Finish());

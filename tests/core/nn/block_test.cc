@@ -44,6 +44,11 @@ TEST(BlockTest, SwishHasItsBeta) {
   }
 }
 
+TEST(BlockTest, WithoutABetaItIsOne) {
+  EXPECT_EQ(HiddenUnit({.hidden_widths = {1}, .activation = Activation::kSwish}, 0),
+            HiddenUnit({.hidden_widths = {1}, .activation = Activation::kSwish, .activation_parameter = 1}, 0));
+}
+
 TEST(BlockTest, ATrainedBetaGoesOnFromTheFixedOne) {
   const BlockSpec spec{.hidden_widths = {1}, .activation = Activation::kSwish, .activation_parameter = 0.3, .trained_beta = true};
   const std::vector<double> first = HiddenUnit(spec, 0.3), later = HiddenUnit(spec, 2);

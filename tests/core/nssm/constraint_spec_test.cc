@@ -43,11 +43,11 @@ TEST(ConstraintSpecTest, WhatIsWrongIsNamed) {
               HasSubstr("model.state_constraint"));
 }
 
-TEST(SpecTest, OnlySwishHasABetaAndItIsPositive) {
+TEST(SpecTest, OnlySwishHasABeta) {
   const auto message = [](const json& decoder) { return std::string(Read({{"output_decoder", decoder}}).status().message()); };
   EXPECT_EQ(message({{"hidden_widths", {3}}, {"activation", "SWISH"}, {"activation_parameter", 0.5}, {"trained_beta", true}}), "");
   EXPECT_THAT(message({{"hidden_widths", {3}}, {"activation", "TANH"}, {"trained_beta", true}}), HasSubstr("model.output_decoder.trained_beta"));
-  EXPECT_THAT(message({{"hidden_widths", {3}}, {"activation", "SWISH"}, {"activation_parameter", 0}}), HasSubstr("model.output_decoder.activation_parameter"));
+  EXPECT_THAT(message({{"hidden_widths", {3}}, {"activation", "SWISH"}, {"activation_parameter", -1}}), HasSubstr("model.output_decoder.activation_parameter"));
 }
 
 TEST(SpecTest, AnglesAreStatesThatExist) {
