@@ -12,9 +12,8 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const data::Trajectory& recording, int64_t from,
-                                             filter::FilterOptions options) {
-  const std::shared_ptr<const filter::FilterModel> functions = filter::FilterModel::Create(model);
+absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,
+                                             const data::Trajectory& recording, int64_t from, filter::FilterOptions options) {
   const std::shared_ptr<const filter::FilterModel::Parameters> parameters = functions->Prepare(model.parameters);
   const std::unique_ptr<filter::FilterModel::Scratch> scratch = functions->MakeScratch();
   const data::Normaliser& units = model.normaliser;

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <memory>
 #include <vector>
 
 #include "absl/status/statusor.h"
@@ -20,11 +21,11 @@ struct FilterRun {
 /// Estimates the states of a model of Case II in `recording` from sample `from` on, where the samples before are the context, whose
 /// states were measured: the filter begins there with x⁻ = f(x_{from−1}, u_{from−1}) and P⁻ = Q.
 ///
-/// @param model  with the parameters and the noise that the filter is to use. @param recording  n_x states and T samples.
+/// @param model  with the parameters and the noise that the filter is to use. @param functions  of its architecture. @param recording  n_x states and T samples.
 /// @param from  at least 1. @param options  of the filter, without its beginning.
 /// Errors: those of filter::Ekf.
-absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const data::Trajectory& recording, int64_t from,
-                                             filter::FilterOptions options = {});
+absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,
+                                             const data::Trajectory& recording, int64_t from, filter::FilterOptions options = {});
 
 /// Share of the errors that bounds of ± `width` standard deviations hold. @param errors  of the means.
 double Coverage(const FilterRun& run, const Eigen::MatrixXd& errors, double width);

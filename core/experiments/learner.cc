@@ -123,4 +123,10 @@ absl::StatusOr<MatrixXd> PredictInBlocks(const SystemModel& model, const Traject
   return predictions;
 }
 
+std::vector<double> RowOf(const MatrixXd& matrix, Eigen::Index row) {
+  std::vector<double> values(static_cast<size_t>(matrix.cols()));
+  for (size_t t = 0; t < values.size(); ++t) values[t] = matrix(row, static_cast<Eigen::Index>(t));
+  return values;
+}
+
 }  // namespace metaekf::experiments

@@ -70,4 +70,7 @@ absl::StatusOr<Eigen::MatrixXd> PredictFreely(const SystemModel& model, const da
 absl::StatusOr<Eigen::MatrixXd> PredictInBlocks(const SystemModel& model, const data::Trajectory& recording, int64_t from,
                                                 int64_t horizon);
 
+/// A row of predictions or states, as a plot takes it.
+std::vector<double> RowOf(const Eigen::MatrixXd& matrix, Eigen::Index row);
+
 }  // namespace metaekf::experiments

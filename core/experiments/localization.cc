@@ -1,6 +1,8 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numbers>
+#include <optional>
 
 #include "core/autodiff/activation.h"
 #include "core/base/numbers.h"
@@ -96,7 +98,8 @@ absl::StatusOr<nssm::Bundle> Adapted(const nssm::Bundle& model, const Trajectory
   return adapted;
 }
 
-absl::StatusOr<Trial> RunTrial(const nssm::Bundle& model, const Trajectory& recording) {
+/// @param functions  of the model, shared by its filters.
+absl::StatusOr<Trial> RunTrial(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions, const Trajectory& recording) {
   Trial trial;
   const double begin = ThreadSeconds();
   const absl::StatusOr<nssm::Bundle> adapted = Adapted(model, recording);
@@ -104,12 +107,12 @@ absl::StatusOr<Trial> RunTrial(const nssm::Bundle& model, const Trajectory& reco
   METAEKF_RETURN_IF_ERROR(adapted.status());
   trial.adaptation_s = ThreadSeconds() - begin;
   const MatrixXd states = recording.states.rightCols(kLocalizationSamples - kLocalizationContext);
-  METAEKF_ASSIGN_OR_RETURN(trial.run, FilterAfterContext(*adapted, recording, kLocalizationContext));
+  METAEKF_ASSIGN_OR_RETURN(trial.run, FilterAfterContext(*adapted, functions, recording, kLocalizationContext));
   const MatrixXd errors = StateErrors(trial.run.means, states);
   trial.adapted = SummedError(errors);
   trial.coverage = 100 * Coverage(trial.run, errors, kWidth95);
   trial.step_s = trial.run.seconds_per_step;
-  METAEKF_ASSIGN_OR_RETURN(const FilterRun unadapted, FilterAfterContext(model, recording, kLocalizationContext));
+  METAEKF_ASSIGN_OR_RETURN(const FilterRun unadapted, FilterAfterContext(model, functions, recording, kLocalizationContext));
   trial.unadapted = SummedError(StateErrors(unadapted.means, states));
   METAEKF_ASSIGN_OR_RETURN(const MatrixXd free_run, PredictFreely(ModelOf(*adapted), recording, kLocalizationContext));
   trial.free_run = SummedError(StateErrors(free_run, states));
@@ -214,12 +217,6 @@ absl::StatusOr<Picture> DrawErrors(const Study& study) {
   return Picture{"errors", std::move(svg)};
 }
 
-std::vector<double> RowOf(const MatrixXd& matrix, Index row) {
-  std::vector<double> values(static_cast<size_t>(matrix.cols()));
-  for (size_t t = 0; t < values.size(); ++t) values[t] = matrix(row, static_cast<Index>(t));
-  return values;
-}
-
 /// States of a target drawn by lot, with their bounds.
 absl::StatusOr<Picture> DrawStates(const Study& study, const std::string& label) {
   const size_t target = std::min(static_cast<size_t>(base::Rng(kFirstSeed, 0).Uniform(0, 1) * static_cast<double>(study.scale.targets)),
@@ -260,7 +257,7 @@ absl::StatusOr<Picture> DrawFields(const Study& study, const sim::MagnetizedSphe
   }
   plot::Series path{.mark = plot::Mark::kDashes, .colour = plot::Colour::kBlack};
   for (int i = 0; i <= 360; ++i) {
-    const Eigen::Vector2d point = sim::ReferencePath(i * M_PI / 180);
+    const Eigen::Vector2d point = sim::ReferencePath(i * std::numbers::pi / 180);
     path.x.push_back(point[0]);
     path.y.push_back(point[1]);
   }
@@ -325,12 +322,16 @@ absl::Status RunSeed(uint64_t seed, const Trajectory& in_papers_field, base::Exe
   const size_t learners = study->learners.size(), targets = target_fleet.dataset.trajectories.size(), before = study->Targets();
   study->targets.push_back(std::move(target_fleet));
   for (std::vector<Trial>& trials : study->trials) trials.resize(before + targets);
+  std::vector<std::shared_ptr<const filter::FilterModel>> functions(learners);
+  for (size_t i = 0; i < learners; ++i) {
+    if (trainings[i].bundle.ok()) functions[i] = filter::FilterModel::Create(*trainings[i].bundle);
+  }
   const auto judge = [&](size_t job) -> absl::Status {
     const size_t learner = job / (targets + 1), target = job % (targets + 1);
     const absl::StatusOr<nssm::Bundle>& model = trainings[learner].bundle;
     if (!model.ok()) return absl::OkStatus();
     if (target < targets) {
-      METAEKF_ASSIGN_OR_RETURN(study->trials[learner][before + target], RunTrial(*model, study->Recording(before + target)));
+      METAEKF_ASSIGN_OR_RETURN(study->trials[learner][before + target], RunTrial(*model, functions[learner], study->Recording(before + target)));
       return absl::OkStatus();
     }
     if (seed != kFirstSeed) return absl::OkStatus();

@@ -276,12 +276,6 @@ std::vector<double> Growth(const Trial& trial, const MatrixXd& truth) {
   return growth;
 }
 
-std::vector<double> RowOf(const MatrixXd& matrix, Eigen::Index row) {
-  std::vector<double> values(static_cast<size_t>(matrix.cols()));
-  for (size_t t = 0; t < values.size(); ++t) values[t] = matrix(row, static_cast<Eigen::Index>(t));
-  return values;
-}
-
 /// Errors in free run of all runs, the exact NARX aside.
 absl::StatusOr<Picture> DrawDistribution(const Results& results) {
   plot::BoxPlot picture{.title = "Errors in free run, all runs", .x_label = "sum of squared errors", .logarithmic = true};

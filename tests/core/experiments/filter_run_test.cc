@@ -30,7 +30,7 @@ TEST(FilterRunTest, BeginsWithTheStateThatTheContextEndsIn) {
   const filter::LinearSystem system;
   const data::Trajectory recording = Recording(system);
   const nssm::Bundle bundle = filter::LinearBundle(system);
-  const absl::StatusOr<FilterRun> run = FilterAfterContext(bundle, recording, kContext);
+  const absl::StatusOr<FilterRun> run = FilterAfterContext(bundle, filter::FilterModel::Create(bundle), recording, kContext);
   ASSERT_TRUE(run.ok()) << run.status();
   ASSERT_EQ(run->means.cols(), kSamples - kContext);
   const VectorXd first = system.A * recording.states.col(kContext - 1) + system.B * recording.inputs.col(kContext - 1);
