@@ -5,7 +5,7 @@
 #include <cstring>
 #include <new>
 
-#include "core/autodiff/kernels.h"
+#include "core/linalg/products.h"
 
 namespace metaekf::autodiff {
 namespace {
@@ -85,8 +85,8 @@ class Machine {
   }
 
   void Product(const Instruction& i, int64_t t, bool accumulate) const {
-    MatMul(i.transpose_a, i.transpose_b, i.rows, i.cols, i.inner, At(i.a, t), i.a.ld, At(i.b, t), i.b.ld, At(i.out, t),
-           i.out.ld, accumulate);
+    linalg::MatMul(i.transpose_a, i.transpose_b, i.rows, i.cols, i.inner, At(i.a, t), i.a.ld, At(i.b, t), i.b.ld, At(i.out, t), i.out.ld,
+                   accumulate);
   }
 
   void Execute(const Instruction& i, int64_t t) const {

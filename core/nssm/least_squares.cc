@@ -7,7 +7,7 @@
 
 #include "core/autodiff/differentiate.h"
 #include "core/autodiff/outer_products.h"
-#include "core/linalg/blas.h"
+#include "core/linalg/products.h"
 
 namespace metaekf::nssm {
 namespace {
@@ -359,8 +359,7 @@ void RolloutLeastSquares::Linearise(const double* parameters, const VectorXd& st
   }
   int64_t rows = 0, squared = 0;
   const auto square = [&] {
-    cblas_dsyrk(CblasColMajor, CblasLower, CblasNoTrans, all, static_cast<int>(rows - squared), 1, w.rows_.col(squared).data(),
-                all, 1, result->curvature.data(), all);
+    linalg::AddSquare(all, static_cast<int32_t>(rows - squared), w.rows_.col(squared).data(), all, result->curvature.data(), all);
     result->gradient.noalias() += w.rows_.middleCols(squared, rows - squared) * w.residuals_.segment(squared, rows - squared);
     squared = rows;
     if (!w.holds_all_) rows = squared = 0;

@@ -1,0 +1,359 @@
+// Products of matrices in vectors, with the instruction set chosen at run time.
+//
+// A tile of C, some vectors of rows by some columns, stays in registers while k runs; each step takes one column of A and one
+// row of B. The tile wants A's columns contiguous and at hand, so a strip of A, as high as the tile and kDepth deep, is copied
+// to a panel where this pays or where A is transposed, and serves all columns of C. For a transposed A and few columns, as
+// when a layer's weights meet one sample and its tangents, the copy would cost more than the product: there both factors are
+// contiguous along k, and a tile is a set of scalar products.
+
+#include "core/linalg/products.h"
+
+#include <algorithm>
+#include <cstddef>
+#include <cstring>
+#include <type_traits>
+
+// Sums stay in registers only where the loops over them are unrolled.
+#undef METAEKF_UNROLL
+#ifdef __clang__
+#define METAEKF_UNROLL _Pragma("clang loop unroll(full)")
+#else
+#define METAEKF_UNROLL _Pragma("GCC unroll 8")
+#endif
+#undef HWY_TARGET_INCLUDE
+#define HWY_TARGET_INCLUDE "core/linalg/products.cc"
+#define HWY_DISABLED_TARGETS (HWY_SSSE3 | HWY_AVX3_DL)  // little gain over their neighbours, long to compile
+#include <hwy/foreach_target.h>
+#include <hwy/highway.h>
+
+HWY_BEFORE_NAMESPACE();
+namespace metaekf::linalg {
+namespace HWY_NAMESPACE {
+namespace hn = hwy::HWY_NAMESPACE;
+
+// Tiles fill the registers: 32 of them with AVX-512, 16 otherwise.
+constexpr bool kManyRegisters = HWY_TARGET <= HWY_AVX3;
+constexpr int kTileVectors = kManyRegisters ? 3 : 2;
+constexpr int kTileColumns = kManyRegisters ? 8 : 6;
+constexpr int kDotRows = kManyRegisters ? 4 : 2;
+constexpr int kDotColumns = 4;
+constexpr int kDepth = 256;
+constexpr int kCopyFromTiles = 4;  // tiles of a strip from which on a copy of it pays
+constexpr int kDotMaxColumns = 12;
+constexpr int kDotMinDepthVectors = 4;
+
+/// A matrix that is read by single elements: element (row, column) is at[row · by_row + column · by_column].
+template <typename T>
+struct Strided {
+  const T* at;
+  ptrdiff_t by_row, by_column;
+};
+
+template <typename T>
+struct Target {
+  T* at;
+  ptrdiff_t ld;
+  bool accumulate;
+};
+
+/// The first `rows` rows of kVectors vectors by kColumns columns of C.
+template <int kVectors, int kColumns, class D, typename T = hn::TFromD<D>>
+HWY_INLINE void Tile(D d, int rows, int k, const T* HWY_RESTRICT a, ptrdiff_t lda, Strided<T> b, Target<T> c) {
+  const int lanes = static_cast<int>(hn::Lanes(d));
+  hn::Vec<D> sums[kColumns][kVectors];
+  METAEKF_UNROLL
+  for (int j = 0; j < kColumns; ++j) {
+    METAEKF_UNROLL
+    for (int i = 0; i < kVectors; ++i) sums[j][i] = hn::Zero(d);
+  }
+  const T* b_row = b.at;
+  for (int l = 0; l < k; ++l, a += lda, b_row += b.by_row) {
+    hn::Vec<D> column[kVectors];
+    METAEKF_UNROLL
+    for (int i = 0; i < kVectors; ++i) column[i] = hn::LoadU(d, a + i * lanes);
+    METAEKF_UNROLL
+    for (int j = 0; j < kColumns; ++j) {
+      const auto factor = hn::Set(d, b_row[j * b.by_column]);
+      METAEKF_UNROLL
+      for (int i = 0; i < kVectors; ++i) sums[j][i] = hn::MulAdd(column[i], factor, sums[j][i]);
+    }
+  }
+  if (rows == kVectors * lanes) {
+    METAEKF_UNROLL
+    for (int j = 0; j < kColumns; ++j) {
+      METAEKF_UNROLL
+      for (int i = 0; i < kVectors; ++i) {
+        T* to = c.at + j * c.ld + i * lanes;
+        hn::StoreU(c.accumulate ? hn::Add(hn::LoadU(d, to), sums[j][i]) : sums[j][i], d, to);
+      }
+    }
+    return;
+  }
+  HWY_ALIGN T buffer[kVectors * hn::MaxLanes(D())];
+  METAEKF_UNROLL
+  for (int j = 0; j < kColumns; ++j) {
+    METAEKF_UNROLL
+    for (int i = 0; i < kVectors; ++i) hn::Store(sums[j][i], d, buffer + i * lanes);
+    T* to = c.at + j * c.ld;
+    for (int i = 0; i < rows; ++i) to[i] = c.accumulate ? to[i] + buffer[i] : buffer[i];
+  }
+}
+
+/// One row of tiles, `columns` wide.
+template <int kVectors, int kColumns, class D, typename T = hn::TFromD<D>>
+HWY_INLINE void Strip(D d, int rows, int columns, int k, const T* a, ptrdiff_t lda, Strided<T> b, Target<T> c) {
+  for (; columns >= kColumns; columns -= kColumns, b.at += kColumns * b.by_column, c.at += kColumns * c.ld) {
+    Tile<kVectors, kColumns>(d, rows, k, a, lda, b, c);
+  }
+  if constexpr (kColumns > 1) {
+    if (columns > 0) Strip<kVectors, (kColumns + 1) / 2>(d, rows, columns, k, a, lda, b, c);
+  }
+}
+
+/// Copies `rows` × k of op(A) to a panel of `height` rows, with zeros below.
+template <class D, typename T = hn::TFromD<D>>
+HWY_INLINE void CopyPanel(D d, int rows, int height, int k, Strided<T> a, T* HWY_RESTRICT panel) {
+  const int lanes = static_cast<int>(hn::Lanes(d));
+  int i = 0;
+  if (a.by_row == 1) {
+    for (; i + lanes <= rows; i += lanes) {
+      for (int l = 0; l < k; ++l) hn::Store(hn::LoadU(d, a.at + i + l * a.by_column), d, panel + i + l * height);
+    }
+  } else {
+    // Four rows at a time: interleaved, they are the fours of each column.
+    const hn::CappedTag<T, 4> narrow;
+    const int width = static_cast<int>(hn::Lanes(narrow));
+    HWY_ALIGN T fours[16];
+    for (; i + 4 <= rows; i += 4) {
+      const T* row = a.at + i * a.by_row;
+      int l = 0;
+      for (; l + width <= k; l += width) {
+        hn::StoreInterleaved4(hn::LoadU(narrow, row + l), hn::LoadU(narrow, row + a.by_row + l),
+                              hn::LoadU(narrow, row + 2 * a.by_row + l), hn::LoadU(narrow, row + 3 * a.by_row + l), narrow, fours);
+        for (int j = 0; j < width; ++j) std::memcpy(panel + i + (l + j) * height, fours + 4 * j, 4 * sizeof(T));
+      }
+      for (; l < k; ++l) {
+        for (int j = 0; j < 4; ++j) panel[i + j + l * height] = row[j * a.by_row + l];
+      }
+    }
+  }
+  for (int l = 0; l < k; ++l) {
+    for (int r = i; r < rows; ++r) panel[r + l * height] = a.at[r * a.by_row + l * a.by_column];
+    for (int r = rows; r < height; ++r) panel[r + l * height] = 0;
+  }
+}
+
+template <class D, typename T = hn::TFromD<D>>
+void Panels(D d, int m, int n, int k, Strided<T> a, Strided<T> b, Target<T> c) {
+  const int lanes = static_cast<int>(hn::Lanes(d)), height = kTileVectors * lanes;
+  HWY_ALIGN T panel[kTileVectors * hn::MaxLanes(D()) * kDepth];
+  if (k == 0 && !c.accumulate) {
+    for (int j = 0; j < n; ++j) std::fill_n(c.at + j * c.ld, m, T(0));
+  }
+  for (int depth = 0; depth < k; depth += kDepth, c.accumulate = true) {
+    const int part = std::min(kDepth, k - depth);
+    const Strided<T> b_part{b.at + depth * b.by_row, b.by_row, b.by_column};
+    const auto strip = [&](auto tag, auto vectors, int row, int rows) HWY_ATTR {
+      constexpr int kVectors = decltype(vectors)::value;
+      const int full = kVectors * static_cast<int>(hn::Lanes(tag));
+      const Strided<T> from{a.at + row * a.by_row + depth * a.by_column, a.by_row, a.by_column};
+      const Target<T> to{c.at + row, c.ld, c.accumulate};
+      if (a.by_row == 1 && rows == full && n < kCopyFromTiles * kTileColumns) {
+        return Strip<kVectors, kTileColumns>(tag, rows, n, part, from.at, a.by_column, b_part, to);
+      }
+      CopyPanel(tag, rows, full, part, from, panel);
+      Strip<kVectors, kTileColumns>(tag, rows, n, part, panel, full, b_part, to);
+    };
+    int row = 0;
+    for (; row + height <= m; row += height) strip(d, std::integral_constant<int, kTileVectors>(), row, height);
+    for (; row + lanes <= m; row += lanes) strip(d, std::integral_constant<int, 1>(), row, lanes);
+    if (row == m) continue;
+    const hn::CappedTag<T, std::max<size_t>(hn::MaxLanes(D()) / 2, 1)> half;
+    const hn::CappedTag<T, std::max<size_t>(hn::MaxLanes(D()) / 4, 1)> quarter;
+    const auto fits = [&](auto tag) { return m - row <= static_cast<int>(hn::Lanes(tag)); };
+    if (fits(quarter)) {
+      strip(quarter, std::integral_constant<int, 1>(), row, m - row);
+    } else if (fits(half)) {
+      strip(half, std::integral_constant<int, 1>(), row, m - row);
+    } else {
+      strip(d, std::integral_constant<int, 1>(), row, m - row);
+    }
+  }
+}
+
+/// The sums over the lanes of four vectors.
+template <class D, typename T = hn::TFromD<D>>
+HWY_INLINE void Sums(D d, const hn::Vec<D>* v, T* sums) {
+#if HWY_TARGET == HWY_SCALAR
+  METAEKF_UNROLL
+  for (int i = 0; i < 4; ++i) sums[i] = hn::GetLane(v[i]);
+  (void)d;
+#else
+  // Pairs of vectors are folded within their blocks of 16 bytes until one block holds a lane of each; blocks are added last.
+  const hn::CappedTag<T, 16 / sizeof(T)> block;
+  const int lanes = static_cast<int>(hn::Lanes(d)), step = static_cast<int>(hn::Lanes(block));
+  HWY_ALIGN T folded[2 * hn::MaxLanes(D())];
+  const auto t0 = hn::Add(hn::InterleaveLower(d, v[0], v[1]), hn::InterleaveUpper(d, v[0], v[1]));
+  const auto t1 = hn::Add(hn::InterleaveLower(d, v[2], v[3]), hn::InterleaveUpper(d, v[2], v[3]));
+  int vectors = 2;
+  if constexpr (sizeof(T) == 4) {
+    const hn::Repartition<double, D> wide;
+    const auto w0 = hn::BitCast(wide, t0), w1 = hn::BitCast(wide, t1);
+    hn::Store(hn::Add(hn::BitCast(d, hn::InterleaveLower(wide, w0, w1)), hn::BitCast(d, hn::InterleaveUpper(wide, w0, w1))), d, folded);
+    vectors = 1;
+  } else {
+    hn::Store(t0, d, folded);
+    hn::Store(t1, d, folded + lanes);
+  }
+  for (int i = 0; i < vectors; ++i) {
+    auto sum = hn::Load(block, folded + i * lanes);
+    for (int j = step; j < lanes; j += step) sum = hn::Add(sum, hn::Load(block, folded + i * lanes + j));
+    hn::StoreU(sum, block, sums + i * step);
+  }
+#endif
+}
+
+/// kRows rows and kColumns columns of C = AᵀB.
+template <int kRows, int kColumns, class D, typename T = hn::TFromD<D>>
+HWY_INLINE void DotTile(D d, int k, const T* HWY_RESTRICT a, ptrdiff_t lda, const T* HWY_RESTRICT b, ptrdiff_t ldb, Target<T> c) {
+  const int lanes = static_cast<int>(hn::Lanes(d));
+  hn::Vec<D> products[kRows][4];
+  METAEKF_UNROLL
+  for (int i = 0; i < kRows; ++i) {
+    METAEKF_UNROLL
+    for (int j = 0; j < 4; ++j) products[i][j] = hn::Zero(d);
+  }
+  int l = 0;
+  for (; l + lanes <= k; l += lanes) {
+    hn::Vec<D> columns[kColumns];
+    METAEKF_UNROLL
+    for (int j = 0; j < kColumns; ++j) columns[j] = hn::LoadU(d, b + j * ldb + l);
+    METAEKF_UNROLL
+    for (int i = 0; i < kRows; ++i) {
+      const auto row = hn::LoadU(d, a + i * lda + l);
+      METAEKF_UNROLL
+      for (int j = 0; j < kColumns; ++j) products[i][j] = hn::MulAdd(row, columns[j], products[i][j]);
+    }
+  }
+  METAEKF_UNROLL
+  for (int i = 0; i < kRows; ++i) {
+    T sums[4];
+    Sums(d, products[i], sums);
+    METAEKF_UNROLL
+    for (int j = 0; j < kColumns; ++j) {
+      T sum = sums[j];
+      for (int r = l; r < k; ++r) sum += a[i * lda + r] * b[j * ldb + r];
+      T* to = c.at + i + j * c.ld;
+      *to = c.accumulate ? *to + sum : sum;
+    }
+  }
+}
+
+template <int kColumns, class D, typename T = hn::TFromD<D>>
+HWY_INLINE void DotColumns(D d, int m, int k, const T* a, ptrdiff_t lda, const T* b, ptrdiff_t ldb, Target<T> c) {
+  int i = 0;
+  for (; i + kDotRows <= m; i += kDotRows) {
+    DotTile<kDotRows, kColumns>(d, k, a + i * lda, lda, b, ldb, {c.at + i, c.ld, c.accumulate});
+  }
+  for (; i < m; ++i) DotTile<1, kColumns>(d, k, a + i * lda, lda, b, ldb, {c.at + i, c.ld, c.accumulate});
+}
+
+template <class D, typename T = hn::TFromD<D>>
+void Dots(D d, int m, int n, int k, const T* a, ptrdiff_t lda, const T* b, ptrdiff_t ldb, Target<T> c) {
+  for (; n >= kDotColumns; n -= kDotColumns, b += kDotColumns * ldb, c.at += kDotColumns * c.ld) {
+    DotColumns<kDotColumns>(d, m, k, a, lda, b, ldb, c);
+  }
+  if (n == 3) return DotColumns<3>(d, m, k, a, lda, b, ldb, c);
+  if (n == 2) return DotColumns<2>(d, m, k, a, lda, b, ldb, c);
+  if (n == 1) return DotColumns<1>(d, m, k, a, lda, b, ldb, c);
+}
+
+template <typename T>
+void Product(bool transpose_a, bool transpose_b, int m, int n, int k, const T* a, int lda, const T* b, int ldb, T* c, int ldc,
+             bool accumulate) {
+  const hn::ScalableTag<T> d;
+  const Target<T> to{c, ldc, accumulate};
+  const int lanes = static_cast<int>(hn::Lanes(d));
+  if (transpose_a && !transpose_b && (n <= kDotMaxColumns || 2 * m < lanes) && k >= kDotMinDepthVectors * lanes) {
+    return Dots(d, m, n, k, a, lda, b, ldb, to);
+  }
+  const Strided<T> by_a = transpose_a ? Strided<T>{a, lda, 1} : Strided<T>{a, 1, lda};
+  const Strided<T> by_b = transpose_b ? Strided<T>{b, ldb, 1} : Strided<T>{b, 1, ldb};
+  Panels(d, m, n, k, by_a, by_b, to);
+}
+
+void FloatProduct(bool transpose_a, bool transpose_b, int m, int n, int k, const float* a, int lda, const float* b, int ldb, float* c,
+                  int ldc, bool accumulate) {
+  Product(transpose_a, transpose_b, m, n, k, a, lda, b, ldb, c, ldc, accumulate);
+}
+void DoubleProduct(bool transpose_a, bool transpose_b, int m, int n, int k, const double* a, int lda, const double* b, int ldb, double* c,
+                   int ldc, bool accumulate) {
+  Product(transpose_a, transpose_b, m, n, k, a, lda, b, ldb, c, ldc, accumulate);
+}
+
+}  // namespace HWY_NAMESPACE
+}  // namespace metaekf::linalg
+HWY_AFTER_NAMESPACE();
+
+#if HWY_ONCE
+namespace metaekf::linalg {
+
+HWY_EXPORT(FloatProduct);
+HWY_EXPORT(DoubleProduct);
+
+namespace {
+
+/// Multiplications below which finding the way to a tile costs more than it saves.
+constexpr int64_t kFew = 64, kFewTransposed = 160;
+
+template <typename T>
+void PlainProduct(bool transpose_a, bool transpose_b, int32_t m, int32_t n, int32_t k, const T* a, int32_t lda, const T* b, int32_t ldb,
+                  T* c, int32_t ldc, bool accumulate) {
+  for (int32_t j = 0; j < n; ++j) {
+    T* column = c + ptrdiff_t{j} * ldc;
+    if (!accumulate) std::fill_n(column, m, T(0));
+    const T* b_column = transpose_b ? b + j : b + ptrdiff_t{j} * ldb;
+    const ptrdiff_t b_row = transpose_b ? ldb : 1;
+    if (transpose_a) {
+      for (int32_t i = 0; i < m; ++i) {
+        const T* row = a + ptrdiff_t{i} * lda;
+        T sum = 0;
+        for (int32_t l = 0; l < k; ++l) sum += row[l] * b_column[l * b_row];
+        column[i] += sum;
+      }
+    } else {
+      for (int32_t l = 0; l < k; ++l) {
+        const T* a_column = a + ptrdiff_t{l} * lda;
+        for (int32_t i = 0; i < m; ++i) column[i] += a_column[i] * b_column[l * b_row];
+      }
+    }
+  }
+}
+
+}  // namespace
+
+template <typename T>
+void MatMul(bool transpose_a, bool transpose_b, int32_t m, int32_t n, int32_t k, const T* a, int32_t lda, const T* b, int32_t ldb, T* c,
+            int32_t ldc, bool accumulate) {
+  if (int64_t{m} * n * k < (transpose_a ? kFewTransposed : kFew)) {
+    return PlainProduct(transpose_a, transpose_b, m, n, k, a, lda, b, ldb, c, ldc, accumulate);
+  }
+  if constexpr (sizeof(T) == sizeof(float)) {
+    HWY_DYNAMIC_DISPATCH(FloatProduct)(transpose_a, transpose_b, m, n, k, a, lda, b, ldb, c, ldc, accumulate);
+  } else {
+    HWY_DYNAMIC_DISPATCH(DoubleProduct)(transpose_a, transpose_b, m, n, k, a, lda, b, ldb, c, ldc, accumulate);
+  }
+}
+
+template void MatMul(bool, bool, int32_t, int32_t, int32_t, const float*, int32_t, const float*, int32_t, float*, int32_t, bool);
+template void MatMul(bool, bool, int32_t, int32_t, int32_t, const double*, int32_t, const double*, int32_t, double*, int32_t, bool);
+
+void AddSquare(int32_t m, int32_t k, const double* a, int32_t lda, double* c, int32_t ldc) {
+  constexpr int32_t kWidth = 48;
+  for (int32_t j = 0; j < m; j += kWidth) {
+    MatMul(false, true, m - j, std::min(kWidth, m - j), k, a + j, lda, a + j, lda, c + j + int64_t{j} * ldc, ldc, true);
+  }
+}
+
+}  // namespace metaekf::linalg
+#endif  // HWY_ONCE
