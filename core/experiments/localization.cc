@@ -74,6 +74,7 @@ struct Study {
     const auto at = std::find_if(learners.begin(), learners.end(), [&label](const Learner& learner) { return learner.label == label; });
     return static_cast<size_t>(at - learners.begin());
   }
+  bool Has(const std::string& label) const { return IndexOf(label) < learners.size(); }
   std::vector<double> Values(size_t learner, double Trial::*quantity) const {
     std::vector<double> values;
     for (const Trial& trial : trials[learner]) values.push_back(trial.*quantity);
@@ -189,17 +190,19 @@ std::vector<std::string> Findings(const Study& study) {
   const auto ratio = [](double a, double b) { return base::FormatShort(a / b, 3); };
   std::vector<std::string> findings;
   for (const std::string& label : {std::string(kMamlSwish), std::string(kPriorSwish), Printed(kMamlSwish)}) {
+    if (!study.Has(label)) continue;
     const double adapted = study.Median(label, &Trial::adapted);
     findings.push_back(absl::StrCat(label, ": median error of the adapted EKF in its ratio to dead reckoning with the true geometry: ",
                                     ratio(adapted, dead_reckoning), ", to the unadapted EKF: ", ratio(adapted, study.Median(label, &Trial::unadapted)), "."));
   }
   for (const auto& [label, free] : {std::pair{std::string(kMamlSwish), std::string(kMamlFree)}, {kPriorSwish, kPriorFree}, {Printed(kMamlSwish), Printed(kMamlFree)}}) {
+    if (!study.Has(label)) continue;
     findings.push_back(absl::StrCat(label, ": median error with a curl-free field in its ratio to that with a free one: ",
                                     ratio(study.Median(label, &Trial::adapted), study.Median(free, &Trial::adapted)), "."));
   }
-  for (const std::string& suffix : {std::string(), Printed("")}) {
-    findings.push_back(absl::StrCat("MAML", suffix, ": swish in its ratio to tanh: ",
-                                    ratio(study.Median(kMamlSwish + suffix, &Trial::adapted), study.Median(kMamlTanh + suffix, &Trial::adapted)), "."));
+  for (const auto& [swish, tanh] : {std::pair{std::string(kMamlSwish), std::string(kMamlTanh)}, {Printed(kMamlSwish), Printed(kMamlTanh)}}) {
+    if (!study.Has(swish)) continue;
+    findings.push_back(absl::StrCat(swish, " in its ratio to ", tanh, ": ", ratio(study.Median(swish, &Trial::adapted), study.Median(tanh, &Trial::adapted)), "."));
   }
   return findings;
 }

@@ -12,7 +12,8 @@ inline constexpr char kMamlSwish[] = "MAML, swish", kMamlTanh[] = "MAML, tanh", 
                       kPriorSwish[] = "Gaussian prior, swish", kPriorFree[] = "Gaussian prior, swish, field not curl-free";
 
 /// What the study of localization trains: MAML, FO-MAML and Reptile with swish and tanh, the learned prior, and what the constraint
-/// buys, all of small networks; then the networks that the paper prints, whose labels end so, in a fraction of their training.
+/// buys, all of small networks; then, in a full study, the networks that the paper prints, whose labels end so, in a fraction of their
+/// training.
 std::vector<Learner> LocalizationLearners(Budget budget);
 
 /// The label of the printed network.
