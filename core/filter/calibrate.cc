@@ -18,6 +18,8 @@ using Eigen::VectorXd;
 namespace {
 
 constexpr double kFirstStep = 1.5, kLastStep = 0.1;  // of ln d²
+constexpr double kWorthwhile = 1e-3;                 // of the likelihood, per sample
+constexpr double kLargestMove = 2, kLeastShare = 0.2;  // towards consistency: of ln d², and of the move
 constexpr double kLargest = 30;                      // |ln d²|: 10¹³
 constexpr double kFailed = -std::numeric_limits<double>::infinity();
 
@@ -90,29 +92,43 @@ absl::Status Begin(const nssm::Bundle& bundle, const std::shared_ptr<const Filte
   return absl::OkStatus();
 }
 
-/// What the mean over samples is of; kFailed where the filter does not stay finite.
-double Score(const nssm::Bundle& bundle, const nssm::FilterNoise& noise, const std::shared_ptr<const FilterModel>& model,
-             const Prepared& run) {
+/// How well a filter explains a recording.
+struct Score {
+  double likelihood = kFailed;  ///< per sample; kFailed where the filter does not stay finite
+  VectorXd squares;             ///< mean of errors squared in their ratio to their variances: of states in Case II, then of innovations
+};
+
+Score ScoreOf(const nssm::Bundle& bundle, const nssm::FilterNoise& noise, const std::shared_ptr<const FilterModel>& model,
+              const Prepared& run) {
   absl::StatusOr<Ekf> ekf = MakeFilter(bundle, noise, model, run);
-  if (!ekf.ok()) return kFailed;
+  if (!ekf.ok()) return {};
   ekf->Restore(run.start);
   const auto scratch = model->MakeScratch();
   Estimate estimate = ekf->MakeEstimate();
-  const bool states = !bundle.model.spec().is_case_one();
+  const Index states = bundle.model.spec().is_case_one() ? 0 : estimate.mean.size(), outputs = estimate.innovation.size();
   double sum = 0;
   int64_t samples = 0;
+  VectorXd squares = VectorXd::Zero(states + outputs), counts = squares;
   for (Index t = run.begin; t < run.trajectory->length(); ++t) {
-    if (!ekf->Step(run.trajectory->inputs.col(t), run.trajectory->outputs.col(t), scratch.get(), &estimate).ok()) return kFailed;
+    if (!ekf->Step(run.trajectory->inputs.col(t), run.trajectory->outputs.col(t), scratch.get(), &estimate).ok()) return {};
     if (estimate.measured == 0) continue;
     sum += LogLikelihood(estimate, bundle.normaliser.outputs.scale);
-    for (Index i = 0; states && i < estimate.mean.size(); ++i) {
-      const double scale = bundle.normaliser.states.scale[i];
-      sum += LogDensity((run.trajectory->states(i, t) - estimate.mean[i]) / scale, estimate.cov(i, i) / (scale * scale));
+    for (Index i = 0; i < states; ++i) {
+      const double scale = bundle.normaliser.states.scale[i], error = run.trajectory->states(i, t) - estimate.mean[i];
+      sum += LogDensity(error / scale, estimate.cov(i, i) / (scale * scale));
+      squares[i] += error * error / estimate.cov(i, i);
+      counts[i] += 1;
+    }
+    for (Index i = 0; i < outputs; ++i) {
+      if (std::isnan(estimate.innovation[i])) continue;
+      squares[states + i] += estimate.innovation[i] * estimate.innovation[i] / estimate.innovation_cov(i, i);
+      counts[states + i] += 1;
     }
     ++samples;
   }
   const double mean = sum / static_cast<double>(samples);
-  return std::isfinite(mean) ? mean : kFailed;
+  if (!std::isfinite(mean)) return {};
+  return {mean, (counts.array() > 0).select(squares.cwiseQuotient(counts), 1)};
 }
 
 }  // namespace
@@ -127,20 +143,41 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
   }
   const Layout layout{.process = bundle.model.spec().is_case_one() ? 1 : bundle.noise.process.rows(),
                       .measurement = bundle.noise.measurement.rows()};
-  const auto objective = [&](const VectorXd& log_scales) {
-    if (log_scales.lpNorm<Eigen::Infinity>() > kLargest) return kFailed;
+  const auto score = [&](const VectorXd& log_scales) {
+    Score total;
+    if (log_scales.lpNorm<Eigen::Infinity>() > kLargest) return total;
     const nssm::FilterNoise noise = Scaled(bundle.noise, log_scales, layout);
-    std::vector<double> scores(prepared.size());
-    executor->ParallelFor(prepared.size(), [&](size_t i, size_t) { scores[i] = Score(bundle, noise, model, prepared[i]); });
-    double sum = 0;
-    for (const double score : scores) sum += score;
-    return sum / static_cast<double>(scores.size()) -
-           0.5 * (log_scales.head(layout.process) / prior.process_std).squaredNorm() -
-           0.5 * (log_scales.tail(layout.measurement) / prior.measurement_std).squaredNorm();
+    std::vector<Score> scores(prepared.size());
+    executor->ParallelFor(prepared.size(), [&](size_t i, size_t) { scores[i] = ScoreOf(bundle, noise, model, prepared[i]); });
+    total = scores[0];
+    for (size_t i = 1; i < scores.size(); ++i) {
+      total.likelihood += scores[i].likelihood;
+      if (total.likelihood > kFailed) total.squares += scores[i].squares;
+    }
+    const double count = static_cast<double>(scores.size());
+    total.squares /= count;
+    total.likelihood = total.likelihood / count - 0.5 * (log_scales.head(layout.process) / prior.process_std).squaredNorm() -
+                       0.5 * (log_scales.tail(layout.measurement) / prior.measurement_std).squaredNorm();
+    return total;
   };
+  const auto objective = [&](const VectorXd& log_scales) { return score(log_scales).likelihood; };
 
   VectorXd best = VectorXd::Zero(layout.size());
-  double value = objective(best);
+  Score found = score(best);
+  // Where every entry has an error of its own, first all of them at once towards what makes that as large as expected: not the
+  // most likely yet, but near it, in few evaluations whatever their number.
+  const bool moves = found.squares.size() == layout.size();
+  for (double share = 1; moves && found.likelihood > kFailed && share >= kLeastShare;) {
+    const VectorXd move = found.squares.array().log().max(-kLargestMove).min(kLargestMove);
+    const Score trial = score(best + share * move);
+    if (trial.likelihood > found.likelihood + kWorthwhile) {
+      best += share * move;
+      found = trial;
+    } else {
+      share /= 2;
+    }
+  }
+  double value = found.likelihood;
   std::vector<VectorXd> directions;
   directions.push_back(VectorXd::Zero(layout.size()));
   directions.back().head(layout.process).setOnes();
@@ -150,12 +187,12 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
     // The only entry of its kind has had its turn.
     if (i < layout.process ? layout.process > 1 : layout.measurement > 1) directions.push_back(VectorXd::Unit(layout.size(), i));
   }
-  for (double step = kFirstStep; step >= kLastStep; step /= 2) {
+  for (double step = moves ? kFirstStep / 4 : kFirstStep; step >= kLastStep; step /= 2) {
     for (bool better = true; better;) {
       better = false;
       for (const VectorXd& direction : directions) {
         for (const double sign : {1.0, -1.0}) {
-          for (double trial; (trial = objective(best + sign * step * direction)) > value + 1e-6;) {
+          for (double trial; (trial = objective(best + sign * step * direction)) > value + kWorthwhile;) {
             value = trial;
             best += sign * step * direction;
             better = true;

@@ -62,7 +62,7 @@ ConstraintEffect Constrain(const physics::Polyhedron& set, VectorXd* mean, Matri
   ConstraintEffect effect{.slack = Slack(set, *mean)};
   if (physics::Contains(set, *mean)) return effect;
   const VectorXd outside = set.G * *mean - set.g;
-  const physics::Projection projection = physics::Project(set, *mean, *factor * factor->transpose());
+  const physics::Projection projection = physics::Project(set, *mean, *factor);
   effect.projection = (projection.point - *mean).norm();
   *mean = projection.point;
   for (const Index row : projection.active) Narrow(set.G.row(row).transpose(), outside[row], factor);

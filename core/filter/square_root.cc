@@ -11,6 +11,12 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::Ref;
 
+namespace {
+
+constexpr Index kRowsAtATime = 32;
+
+}  // namespace
+
 void LowerTriangularise(Ref<MatrixXd> a) {
   const Index rows = a.rows(), cols = a.cols();
   for (Index i = 0; i < rows; ++i) {
@@ -23,12 +29,22 @@ void LowerTriangularise(Ref<MatrixXd> a) {
       const double v0 = head <= 0 ? head - norm : -squared / (head + norm);  // no cancellation
       const double beta = 2 * v0 * v0 / (squared + v0 * v0);
       for (Index j = i + 1; j < cols; ++j) a(i, j) /= v0;  // the reflection's vector is (1, this)
-      for (Index k = i + 1; k < rows; ++k) {
-        double dot = a(k, i);
-        for (Index j = i + 1; j < cols; ++j) dot += a(k, j) * a(i, j);
-        dot *= beta;
-        a(k, i) -= dot;
-        for (Index j = i + 1; j < cols; ++j) a(k, j) -= dot * a(i, j);
+      // Down the columns, as they lie in memory, for some rows at a time.
+      for (Index first = i + 1; first < rows; first += kRowsAtATime) {
+        const Index count = std::min(kRowsAtATime, rows - first);
+        double dots[kRowsAtATime];
+        for (Index k = 0; k < count; ++k) dots[k] = a(first + k, i);
+        for (Index j = i + 1; j < cols; ++j) {
+          const double factor = a(i, j);
+          const double* column = &a(first, j);
+          for (Index k = 0; k < count; ++k) dots[k] += column[k] * factor;
+        }
+        for (Index k = 0; k < count; ++k) a(first + k, i) -= dots[k] *= beta;
+        for (Index j = i + 1; j < cols; ++j) {
+          const double factor = a(i, j);
+          double* column = &a(first, j);
+          for (Index k = 0; k < count; ++k) column[k] -= dots[k] * factor;
+        }
       }
       a(i, i) = norm;
       for (Index j = i + 1; j < cols; ++j) a(i, j) = 0;

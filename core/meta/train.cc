@@ -89,9 +89,9 @@ absl::StatusOr<std::vector<double>> SharedParameters(const TrainingSpec& spec, c
   return std::move(learned.parameters);
 }
 
-/// What a filter of a system is calibrated on: at most so many samples behind its context, or all of a recording that is hardly
-/// longer than that.
-constexpr int64_t kCalibrationSamples = 2000, kFewSamples = 50;
+/// What a filter of a system is calibrated on: at most so many samples behind its context, fewer the more there is to be found, or all
+/// of a recording that is hardly longer than that.
+constexpr int64_t kCalibrationSamples = 2000, kCalibrationValues = 12000, kFewSamples = 50;
 
 /// Default Q, R and P₀ from the residuals of the model adapted to each of `systems`, Q and R scaled to what filters of these systems
 /// meet after the context (filter::Calibrate).
@@ -106,6 +106,7 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const Trai
     // An adaptation that diverges says nothing about noise; the unadapted model stands in.
     parameters[i] = adapted.ok() ? *std::move(adapted) : bundle.parameters;
   });
+  const int64_t most = std::min(kCalibrationSamples, kCalibrationValues / (spec.model.state_size + spec.model.output_size));
   filter::NoiseEstimate noise(bundle);
   std::vector<filter::CalibrationRun> runs;
   for (size_t i = 0; i < systems.size(); ++i) {
@@ -113,7 +114,7 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const Trai
     noise.Add(parameters[i], normalised);
     const int64_t begin = systems[i].length() - wanted < kFewSamples ? 0 : wanted;
     METAEKF_ASSIGN_OR_RETURN(const Trajectory later, data::SamplesFrom(systems[i], begin));
-    METAEKF_ASSIGN_OR_RETURN(Trajectory run, data::FirstSamples(later, std::min<int64_t>(later.length(), kCalibrationSamples)));
+    METAEKF_ASSIGN_OR_RETURN(Trajectory run, data::FirstSamples(later, std::min<int64_t>(later.length(), most)));
     runs.push_back({parameters[i], std::move(run)});
   }
   bundle.noise = noise.Result(bundle.normaliser);

@@ -129,10 +129,8 @@ std::optional<Projection> ProjectAlong(const Polyhedron& set, const VectorXd& z,
 
 }  // namespace
 
-Projection Project(const Polyhedron& set, const VectorXd& z, const MatrixXd& cov) {
+Projection Project(const Polyhedron& set, const VectorXd& z, const MatrixXd& root) {
   if (Contains(set, z)) return {z, {}};
-  const linalg::SymmetricEigen eigen = linalg::DecomposeSymmetric(cov);
-  const MatrixXd root = eigen.vectors * eigen.values.cwiseMax(0).cwiseSqrt().asDiagonal();
   if (std::optional<Projection> found = ProjectAlong(set, z, root)) return *found;
   if (std::optional<Projection> found = ProjectAlong(set, z, MatrixXd::Identity(z.size(), z.size()))) return *found;
   return {Anchor(set), {}};
