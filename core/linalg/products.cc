@@ -306,26 +306,35 @@ namespace {
 /// Multiplications below which finding the way to a tile costs more than it saves.
 constexpr int64_t kFew = 64, kFewTransposed = 160;
 
-template <typename T>
-void PlainProduct(bool transpose_a, bool transpose_b, int32_t m, int32_t n, int32_t k, const T* a, int32_t lda, const T* b, int32_t ldb,
-                  T* c, int32_t ldc, bool accumulate) {
+template <bool transpose_b, typename T>
+void PlainProduct(bool transpose_a, int32_t m, int32_t n, int32_t k, const T* a, int32_t lda, const T* b, int32_t ldb, T* c,
+                  int32_t ldc, bool accumulate) {
+  const ptrdiff_t b_row = transpose_b ? ldb : 1;
   for (int32_t j = 0; j < n; ++j) {
     T* column = c + ptrdiff_t{j} * ldc;
     if (!accumulate) std::fill_n(column, m, T(0));
     const T* b_column = transpose_b ? b + j : b + ptrdiff_t{j} * ldb;
-    const ptrdiff_t b_row = transpose_b ? ldb : 1;
-    if (transpose_a) {
-      for (int32_t i = 0; i < m; ++i) {
-        const T* row = a + ptrdiff_t{i} * lda;
-        T sum = 0;
-        for (int32_t l = 0; l < k; ++l) sum += row[l] * b_column[l * b_row];
-        column[i] += sum;
-      }
-    } else {
+    if (!transpose_a) {
       for (int32_t l = 0; l < k; ++l) {
         const T* a_column = a + ptrdiff_t{l} * lda;
         for (int32_t i = 0; i < m; ++i) column[i] += a_column[i] * b_column[l * b_row];
       }
+      continue;
+    }
+    int32_t i = 0;
+    for (; i + 4 <= m; i += 4) {  // four sums that need not wait for each other
+      const T* row = a + ptrdiff_t{i} * lda;
+      T sums[4] = {};
+      for (int32_t l = 0; l < k; ++l) {
+        for (int32_t r = 0; r < 4; ++r) sums[r] += row[r * ptrdiff_t{lda} + l] * b_column[l * b_row];
+      }
+      for (int32_t r = 0; r < 4; ++r) column[i + r] += sums[r];
+    }
+    for (; i < m; ++i) {
+      const T* row = a + ptrdiff_t{i} * lda;
+      T sum = 0;
+      for (int32_t l = 0; l < k; ++l) sum += row[l] * b_column[l * b_row];
+      column[i] += sum;
     }
   }
 }
@@ -336,7 +345,8 @@ template <typename T>
 void MatMul(bool transpose_a, bool transpose_b, int32_t m, int32_t n, int32_t k, const T* a, int32_t lda, const T* b, int32_t ldb, T* c,
             int32_t ldc, bool accumulate) {
   if (int64_t{m} * n * k < (transpose_a ? kFewTransposed : kFew)) {
-    return PlainProduct(transpose_a, transpose_b, m, n, k, a, lda, b, ldb, c, ldc, accumulate);
+    return transpose_b ? PlainProduct<true>(transpose_a, m, n, k, a, lda, b, ldb, c, ldc, accumulate)
+                       : PlainProduct<false>(transpose_a, m, n, k, a, lda, b, ldb, c, ldc, accumulate);
   }
   if constexpr (sizeof(T) == sizeof(float)) {
     HWY_DYNAMIC_DISPATCH(FloatProduct)(transpose_a, transpose_b, m, n, k, a, lda, b, ldb, c, ldc, accumulate);
