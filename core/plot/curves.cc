@@ -45,7 +45,7 @@ void DrawSeries(const Area& area, const Series& series, const char* colour, std:
     }
     pen_down = drawable;
   }
-  absl::StrAppend(&svg, "<path d=\"", path, "\" stroke=\"", colour, "\" class=\"curve\"",
+  absl::StrAppend(&svg, "<path d=\"", path, "\" fill=\"none\" stroke=\"", colour, "\" class=\"curve\"",
                   series.mark == Mark::kDashes ? " stroke-dasharray=\"6 4\"" : "", "/>\n");
 }
 

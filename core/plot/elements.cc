@@ -53,7 +53,7 @@ std::string BeginDocument(double width, double height) {
   return absl::StrCat("<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"", Number(width), "\" height=\"", Number(height),
                       "\" viewBox=\"0 0 ", Number(width), " ", Number(height),
                       "\" font-family=\"DejaVu Sans, Helvetica, Arial, sans-serif\" font-size=\"12\">\n"
-                      "<style>text{fill:#222222}</style>\n<rect width=\"100%\" height=\"100%\" fill=\"white\"/>\n");
+                      "<style>text{fill:#222222}.curve{stroke-width:1.5}</style>\n<rect width=\"100%\" height=\"100%\" fill=\"white\"/>\n");
 }
 
 void Line(double x1, double y1, double x2, double y2, const char* colour, std::string& svg) {

@@ -12,9 +12,10 @@ namespace {
 
 using Eigen::Index;
 
-constexpr double kMapPx = 300, kGapPx = 26, kLeftPx = 58, kTopPx = 66, kBottomPx = 52, kBarPx = 16, kBarLabelsPx = 92;
+constexpr double kMapPx = 300, kGapPx = 26, kLeftPx = 66, kTopPx = 66, kBottomPx = 52, kBarPx = 16, kBarLabelsPx = 92;
 constexpr int kColours = 24;
 constexpr int kBlank = -1;
+constexpr char kWithoutSeams[] = "<g shape-rendering=\"crispEdges\">\n";  // of smoothed edges between cells
 
 /// The step of the colour scale that a value has, kBlank if it has none.
 int StepOf(double value, const Axis& scale) {
@@ -40,6 +41,7 @@ Axis ColourScale(const FieldMaps& maps) {
 void DrawCells(const FieldMap& map, const Area& area, const Axis& scale, std::string& svg) {
   const Index rows = map.values.rows(), columns = map.values.cols();
   const double width = area.width / static_cast<double>(columns), height = area.height / static_cast<double>(rows);
+  svg += kWithoutSeams;
   for (Index row = 0; row < rows; ++row) {
     const double top = area.top + height * static_cast<double>(rows - 1 - row);
     for (Index first = 0, next = 0; first < columns; first = next) {
@@ -50,14 +52,17 @@ void DrawCells(const FieldMap& map, const Area& area, const Axis& scale, std::st
                       Number(width * static_cast<double>(next - first)), "\" height=\"", Number(height), "\" fill=\"", ColourOf(step), "\"/>\n");
     }
   }
+  svg += "</g>\n";
 }
 
 void DrawColourBar(const Area& area, const std::string& label, std::string& svg) {
   const double step = area.height / kColours;
+  svg += kWithoutSeams;
   for (int i = 0; i < kColours; ++i) {
     absl::StrAppend(&svg, "<rect x=\"", Number(area.left), "\" y=\"", Number(area.top + step * (kColours - 1 - i)), "\" width=\"", Number(kBarPx),
                     "\" height=\"", Number(step), "\" fill=\"", ColourOf(i), "\"/>\n");
   }
+  svg += "</g>\n";
   for (const Tick& tick : area.y.ticks) {
     if (!tick.label.empty()) Text(area.left + kBarPx + 6, area.Y(tick.value) + 4, tick.label, "", svg);
   }
@@ -87,7 +92,8 @@ absl::StatusOr<std::string> RenderSvg(const FieldMaps& maps) {
   }
   area.left = kLeftPx;
   for (const Tick& tick : area.y.ticks) Text(kLeftPx - 6, area.Y(tick.value) + 4, tick.label, " text-anchor=\"end\"", svg);
-  Text(12, kTopPx - 10, maps.y_label, "", svg);
+  const double middle = kTopPx + map_height / 2;
+  Text(18, middle, maps.y_label, absl::StrCat(" text-anchor=\"middle\" transform=\"rotate(-90 18 ", Number(middle), ")\""), svg);
   DrawColourBar({.left = bar, .top = kTopPx, .width = kBarPx, .height = map_height, .x = {}, .y = scale}, maps.value_label, svg);
   return svg + "</svg>\n";
 }
