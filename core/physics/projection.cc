@@ -17,6 +17,7 @@ namespace {
 
 constexpr double kEpsilon = std::numeric_limits<double>::epsilon();
 constexpr double kOptimal = 1e-12;  // of |E||f|: what a gradient may be at the minimum
+constexpr double kAtApex = 1e-12;   // of |z|: what is left of a point that is 0
 constexpr int kRetreats = 8;        // of planes that are moved inwards until rounding does no harm
 
 /// u ≥ 0 that minimises |E u − f|, by Lawson and Hanson's active sets.
@@ -122,7 +123,10 @@ std::optional<Projection> ProjectAlong(const Polyhedron& set, const VectorXd& z,
     // On the planes of those rows, G_S (z + root y) = g_S, to the last digits.
     const MatrixXd planes = A(result.active, Eigen::all);
     result.point = z + root * VectorXd(linalg::SolveLeastSquares(planes, MatrixXd(room(result.active))));
-    if (result.point.allFinite() && Contains(set, result.point)) return result;
+    if (!result.point.allFinite()) continue;
+    if (Contains(set, result.point)) return result;
+    // An apex of 0 is met by no sum whose terms cancel, and is itself inside.
+    if (set.vertices.cols() == 0 && result.point.norm() <= kAtApex * z.norm()) return Projection{VectorXd::Zero(z.size()), result.active};
   }
   return std::nullopt;
 }

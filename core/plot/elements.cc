@@ -49,6 +49,10 @@ void Text(double x, double y, const std::string& text, const std::string& attrib
                   Escaped(text), "</text>\n");
 }
 
+void UprightText(double x, double middle, const std::string& text, std::string& svg) {
+  Text(x, middle, text, absl::StrCat(" text-anchor=\"middle\" transform=\"rotate(-90 ", Number(x), " ", Number(middle), ")\""), svg);
+}
+
 std::string BeginDocument(double width, double height) {
   return absl::StrCat("<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"", Number(width), "\" height=\"", Number(height),
                       "\" viewBox=\"0 0 ", Number(width), " ", Number(height),

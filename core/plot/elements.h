@@ -15,6 +15,8 @@ std::string Number(double value);
 /// Appends a text, escaped, with its base line at y. `attributes` is empty or begins with a blank.
 void Text(double x, double y, const std::string& text, const std::string& attributes,
           std::string& svg);
+/// A text that reads upwards, with its middle at `middle`.
+void UprightText(double x, double middle, const std::string& text, std::string& svg);
 
 /// Appends a straight line.
 void Line(double x1, double y1, double x2, double y2, const char* colour, std::string& svg);

@@ -92,8 +92,7 @@ absl::StatusOr<std::string> RenderSvg(const FieldMaps& maps) {
   }
   area.left = kLeftPx;
   for (const Tick& tick : area.y.ticks) Text(kLeftPx - 6, area.Y(tick.value) + 4, tick.label, " text-anchor=\"end\"", svg);
-  const double middle = kTopPx + map_height / 2;
-  Text(18, middle, maps.y_label, absl::StrCat(" text-anchor=\"middle\" transform=\"rotate(-90 18 ", Number(middle), ")\""), svg);
+  UprightText(18, kTopPx + map_height / 2, maps.y_label, svg);
   DrawColourBar({.left = bar, .top = kTopPx, .width = kBarPx, .height = map_height, .x = {}, .y = scale}, maps.value_label, svg);
   return svg + "</svg>\n";
 }

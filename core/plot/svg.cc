@@ -95,9 +95,7 @@ void DrawAxes(const Area& area, const Panel& panel, bool last, const std::string
                   "\" stroke=\"#888888\"/>\n");
   const std::string y_label =
       area.y.factor.empty() ? panel.y_label : panel.y_label + "  " + area.y.factor;
-  const std::string middle = Number(area.top + area.height / 2);
-  Text(18, area.top + area.height / 2, y_label,
-       absl::StrCat(" text-anchor=\"middle\" transform=\"rotate(-90 18 ", middle, ")\""), svg);
+  UprightText(18, area.top + area.height / 2, y_label, svg);
   if (!last) return;
   const std::string label = area.x.factor.empty() ? x_label : x_label + "  " + area.x.factor;
   Text(area.left + area.width / 2, bottom + 38, label, " text-anchor=\"middle\"", svg);
