@@ -106,7 +106,7 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const Trai
     // An adaptation that diverges says nothing about noise; the unadapted model stands in.
     parameters[i] = adapted.ok() ? *std::move(adapted) : bundle.parameters;
   });
-  const int64_t most = std::min(kCalibrationSamples, kCalibrationValues / (spec.model.state_size + spec.model.output_size));
+  const int64_t most = std::clamp(kCalibrationValues / (spec.model.state_size + spec.model.output_size), kFewSamples, kCalibrationSamples);
   filter::NoiseEstimate noise(bundle);
   std::vector<filter::CalibrationRun> runs;
   for (size_t i = 0; i < systems.size(); ++i) {
