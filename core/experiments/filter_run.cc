@@ -4,13 +4,25 @@
 #include <utility>
 
 #include "core/base/status.h"
+#include "core/data/split.h"
 #include "core/experiments/jobs.h"
+#include "core/meta/adapt.h"
 
 namespace metaekf::experiments {
 
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
+
+absl::StatusOr<nssm::Bundle> AdaptForFilter(const nssm::Bundle& model, const data::Trajectory& recording, int64_t context_samples) {
+  METAEKF_ASSIGN_OR_RETURN(const data::Trajectory context, data::FirstSamples(recording, context_samples));
+  METAEKF_ASSIGN_OR_RETURN(const meta::AdaptationOptions options, meta::DefaultAdaptation(model));
+  METAEKF_ASSIGN_OR_RETURN(meta::AdaptationResult result, meta::Adapt(model, context, options, nullptr));
+  nssm::Bundle adapted = model;
+  adapted.parameters = std::move(result.parameters);
+  adapted.noise = std::move(result.noise);
+  return adapted;
+}
 
 absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,
                                              const data::Trajectory& recording, int64_t from, filter::FilterOptions options) {
@@ -26,13 +38,14 @@ absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const st
   options.initial_cov = options.process_cov.value_or(model.noise.process);
   METAEKF_ASSIGN_OR_RETURN(filter::Ekf ekf, filter::Ekf::Create(model, functions, parameters, options));
   filter::Estimate estimate = ekf.MakeEstimate();
-  FilterRun run{.means = MatrixXd(n, count), .deviations = MatrixXd(n, count), .nis = VectorXd(count)};
+  FilterRun run{.means = MatrixXd(n, count), .deviations = MatrixXd(n, count), .nis = VectorXd(count), .projection = VectorXd(count)};
   const double begin = ThreadSeconds();
   for (Index t = 0; t < count; ++t) {
     METAEKF_RETURN_IF_ERROR(ekf.Step(recording.inputs.col(from + t), recording.outputs.col(from + t), scratch.get(), &estimate));
     run.means.col(t) = estimate.mean;
     run.deviations.col(t) = estimate.cov.diagonal().cwiseSqrt();
     run.nis[t] = estimate.nis;
+    run.projection[t] = estimate.projection;
     run.health.push_back(estimate.health);
   }
   run.seconds_per_step = (ThreadSeconds() - begin) / static_cast<double>(count);

@@ -14,9 +14,14 @@ namespace metaekf::experiments {
 struct FilterRun {
   Eigen::MatrixXd means, deviations;  ///< of every state, after the sample's measurement
   Eigen::VectorXd nis;
+  Eigen::VectorXd projection;  ///< how far estimates were moved into the model's set, in scales of the states; NaN without one
   std::vector<filter::Health> health;
   double seconds_per_step = 0;  ///< of the processor
 };
+
+/// The model adapted to the first `context_samples` of a recording as its training says, with the noise that it found there.
+/// Errors: those of meta::Adapt.
+absl::StatusOr<nssm::Bundle> AdaptForFilter(const nssm::Bundle& model, const data::Trajectory& recording, int64_t context_samples);
 
 /// Estimates the states of a model of Case II in `recording` from sample `from` on, where the samples before are the context, whose
 /// states were measured: the filter begins there with x⁻ = f(x_{from−1}, u_{from−1}) and P⁻ = Q.

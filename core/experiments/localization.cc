@@ -8,13 +8,11 @@
 #include "core/base/numbers.h"
 #include "core/base/rng.h"
 #include "core/base/status.h"
-#include "core/data/split.h"
 #include "core/experiments/filter_run.h"
 #include "core/experiments/jobs.h"
 #include "core/experiments/localization_data.h"
 #include "core/experiments/localization_learners.h"
 #include "core/experiments/studies.h"
-#include "core/meta/adapt.h"
 #include "core/plot/box_plot.h"
 #include "core/plot/field_maps.h"
 #include "core/plot/svg.h"
@@ -88,22 +86,11 @@ struct Study {
   MatrixXd TrueStates(size_t target) const { return Recording(target).states.rightCols(kLocalizationSamples - kLocalizationContext); }
 };
 
-/// The model adapted to the first samples of a recording, with the noise that it found there.
-absl::StatusOr<nssm::Bundle> Adapted(const nssm::Bundle& model, const Trajectory& recording) {
-  METAEKF_ASSIGN_OR_RETURN(const Trajectory context, data::FirstSamples(recording, kLocalizationContext));
-  METAEKF_ASSIGN_OR_RETURN(const meta::AdaptationOptions options, meta::DefaultAdaptation(model));
-  METAEKF_ASSIGN_OR_RETURN(meta::AdaptationResult result, meta::Adapt(model, context, options, nullptr));
-  nssm::Bundle adapted = model;
-  adapted.parameters = std::move(result.parameters);
-  adapted.noise = std::move(result.noise);
-  return adapted;
-}
-
 /// @param functions  of the model, shared by its filters.
 absl::StatusOr<Trial> RunTrial(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions, const Trajectory& recording) {
   Trial trial;
   const double begin = ThreadSeconds();
-  const absl::StatusOr<nssm::Bundle> adapted = Adapted(model, recording);
+  const absl::StatusOr<nssm::Bundle> adapted = AdaptForFilter(model, recording, kLocalizationContext);
   if (IsDivergence(adapted.status())) return trial;
   METAEKF_RETURN_IF_ERROR(adapted.status());
   trial.adaptation_s = ThreadSeconds() - begin;
@@ -338,7 +325,7 @@ absl::Status RunSeed(uint64_t seed, const Trajectory& in_papers_field, base::Exe
       return absl::OkStatus();
     }
     if (seed != kFirstSeed) return absl::OkStatus();
-    const absl::StatusOr<nssm::Bundle> adapted = Adapted(*model, in_papers_field);
+    const absl::StatusOr<nssm::Bundle> adapted = AdaptForFilter(*model, in_papers_field, kLocalizationContext);
     if (adapted.ok()) study->fields[learner] = FieldOf(*adapted, study->scale.cells);
     return IsDivergence(adapted.status()) ? absl::OkStatus() : adapted.status();
   };

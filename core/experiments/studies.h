@@ -19,4 +19,7 @@ Experiment FewShotCurve();
 /// Vehicles that find their position by an unknown magnetic field (paper.tex sec. localization).
 Experiment Localization();
 
+/// Refrigeration cycles whose pressures fall along the flow (paper.tex sec. vapor compression).
+Experiment VaporCompressionStudy();
+
 }  // namespace metaekf::experiments

@@ -1,7 +1,9 @@
 #include "core/filter/calibrate.h"
 
 #include <Eigen/Cholesky>
+#include <algorithm>
 #include <cmath>
+#include <functional>
 #include <limits>
 #include <memory>
 #include <numbers>
@@ -17,10 +19,12 @@ using Eigen::VectorXd;
 
 namespace {
 
-constexpr double kFirstStep = 1.5, kLastStep = 0.1;  // of ln d²
-constexpr double kWorthwhile = 1e-3;                 // of the likelihood, per sample
-constexpr double kLargestMove = 2, kLeastShare = 0.2;  // towards consistency: of ln d², and of the move
-constexpr double kLargest = 30;                      // |ln d²|: 10¹³
+constexpr double kProbe = 0.4;           // of ln d², to see a slope and a curvature
+constexpr double kWorthwhile = 1e-3;     // of the likelihood, per sample and entry
+constexpr int kRounds = 6;               // of a model that follows its system two or three do
+constexpr double kLargestMove = 2;       // of ln d²
+constexpr double kLeastShare = 0.2;      // of a move
+constexpr double kLargest = 30;          // |ln d²|: 10¹³
 constexpr double kFailed = -std::numeric_limits<double>::infinity();
 
 /// Where a scale acts.
@@ -131,6 +135,16 @@ Score ScoreOf(const nssm::Bundle& bundle, const nssm::FilterNoise& noise, const 
   return {mean, (counts.array() > 0).select(squares.cwiseQuotient(counts), 1)};
 }
 
+/// Where along a direction the parabola through three values has its top, or how far towards the greater one is dared.
+double TopOfParabola(const std::function<double(const VectorXd&)>& objective, const VectorXd& at, double value, const VectorXd& direction) {
+  const double up = objective(at + kProbe * direction), down = objective(at - kProbe * direction);
+  if (!(std::max(up, down) > kFailed)) return 0;
+  const double slope = (up - down) / (2 * kProbe), curvature = (up - 2 * value + down) / (kProbe * kProbe);
+  if (std::isfinite(slope) && curvature < 0) return std::clamp(-slope / curvature, -kLargestMove, kLargestMove);
+  const double better = std::max(up, down);
+  return better > value ? (up > down ? kLargestMove : -kLargestMove) : 0;
+}
+
 }  // namespace
 
 nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, const CalibrationPrior& prior,
@@ -170,7 +184,7 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
   for (double share = 1; moves && found.likelihood > kFailed && share >= kLeastShare;) {
     const VectorXd move = found.squares.array().log().max(-kLargestMove).min(kLargestMove);
     const Score trial = score(best + share * move);
-    if (trial.likelihood > found.likelihood + kWorthwhile) {
+    if (trial.likelihood > found.likelihood + kWorthwhile * static_cast<double>(layout.size())) {
       best += share * move;
       found = trial;
     } else {
@@ -178,28 +192,27 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
     }
   }
   double value = found.likelihood;
-  std::vector<VectorXd> directions;
-  directions.push_back(VectorXd::Zero(layout.size()));
-  directions.back().head(layout.process).setOnes();
-  directions.push_back(VectorXd::Zero(layout.size()));
-  directions.back().tail(layout.measurement).setOnes();
-  for (Index i = 0; i < layout.size(); ++i) {
-    // The only entry of its kind has had its turn.
-    if (i < layout.process ? layout.process > 1 : layout.measurement > 1) directions.push_back(VectorXd::Unit(layout.size(), i));
-  }
-  for (double step = moves ? kFirstStep / 4 : kFirstStep; step >= kLastStep; step /= 2) {
-    for (bool better = true; better;) {
-      better = false;
-      for (const VectorXd& direction : directions) {
-        for (const double sign : {1.0, -1.0}) {
-          for (double trial; (trial = objective(best + sign * step * direction)) > value + kWorthwhile;) {
-            value = trial;
-            best += sign * step * direction;
-            better = true;
-          }
-        }
-      }
+  const auto improve = [&](const VectorXd& move) {
+    for (double share = 1; share >= kLeastShare; share /= 2) {
+      const double trial = objective(best + share * move);
+      if (!(trial > value + kWorthwhile)) continue;
+      best += share * move;
+      value = trial;
+      return;
     }
+  };
+  VectorXd all_process = VectorXd::Zero(layout.size()), all_measurement = all_process;
+  all_process.head(layout.process).setOnes();
+  all_measurement.tail(layout.measurement).setOnes();
+  double before = kFailed;
+  for (int round = 0; round < kRounds && value > before + kWorthwhile * static_cast<double>(layout.size()); ++round) {
+    before = value;
+    // What Q and R can trade with each other is seen along these two; then every entry goes where its own parabola has its top.
+    for (const VectorXd& together : {all_process, all_measurement}) improve(TopOfParabola(objective, best, value, together) * together);
+    if (layout.process == 1 && layout.measurement == 1) continue;
+    VectorXd move(layout.size());
+    for (Index i = 0; i < move.size(); ++i) move[i] = TopOfParabola(objective, best, value, VectorXd::Unit(move.size(), i));
+    improve(move);
   }
   return Scaled(bundle.noise, best, layout);
 }

@@ -30,8 +30,9 @@ struct CalibrationPrior {
 ///   max over D of  mean over runs of  1/T Σ_t [ ln N(ỹ_t; 0, S_t) + Σ_i ln N(x_{t,i}; x̂_{t,i}, P_{t,ii}) ] − Σ (ln d²)²/(2 s²),
 ///
 /// the sum over states i in Case II, where they are recorded and filters begin at the first of them. In Case I, whose latents have no
-/// axes of their own, D_q is a multiple of the identity. In Case II first all at once in proportion to the errors, then by coordinate search in
-/// ln d², all of Q and all of R first, to a tenth.
+/// axes of their own, D_q is a multiple of the identity. In Case II first all at once in proportion to the errors; then, in ln d², all of Q, all of R and
+/// every entry go to the tops of parabolas through three values each, until a round is worth less than 1e-3 an
+/// entry, six times at most.
 ///
 /// @param bundle  with Q₀, R₀ and P₀ in its noise. @param runs  at least one, of systems that the parameters were not fitted to, or of
 ///   samples that come after those. @param prior  s of ln d², beside the mean over samples.

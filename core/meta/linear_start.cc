@@ -1,12 +1,12 @@
 #include "core/meta/linear_start.h"
 
-
 #include <algorithm>
 #include <cmath>
 
 #include "absl/strings/str_cat.h"
 #include "core/base/rng.h"
 #include "core/linalg/decompositions.h"
+#include "core/nn/parameters.h"
 
 namespace metaekf::meta {
 namespace {
@@ -45,20 +45,6 @@ std::vector<MatrixXd> ImpulseResponse(const data::Trajectory& recording, Index o
     response.push_back(h);
   }
   return response;
-}
-
-/// Where a tensor stands in ω, as out × in. @return false if the layout has none of that name.
-bool Put(const nn::ParameterLayout& layout, const std::string& name, const MatrixXd& value, std::vector<double>* parameters) {
-  for (const nn::Tensor& tensor : layout.tensors()) {
-    if (tensor.name != name) continue;
-    for (Index i = 0; i < value.rows(); ++i) {
-      for (Index j = 0; j < value.cols(); ++j) {
-        (*parameters)[static_cast<size_t>(tensor.offset + i * tensor.in + j)] = value(i, j);
-      }
-    }
-    return true;
-  }
-  return false;
 }
 
 }  // namespace
@@ -118,12 +104,11 @@ absl::StatusOr<std::vector<double>> LinearStart(const nssm::Model& model, const 
   }
 
   std::vector<double> parameters = model.InitialParameters(seed);
-  const nn::ParameterLayout& layout = model.layout();
-  if (!Put(layout, "transition.state_bypass.weight", transition, &parameters) ||
-      !Put(layout, "transition.input_bypass.weight", input, &parameters) ||
-      !Put(layout, "output_decoder.0.weight", output, &parameters)) {
-    return absl::InvalidArgumentError("a linear start needs inputs beside the linear bypass");
-  }
+  const auto tensor = [&](const std::string& name) { return nn::TensorIn(model.layout(), name, parameters); };
+  if (tensor("transition.input_bypass.weight").size() == 0) return absl::InvalidArgumentError("a linear start needs inputs beside the linear bypass");
+  tensor("transition.state_bypass.weight") = transition;
+  tensor("transition.input_bypass.weight") = input;
+  tensor("output_decoder.0.weight") = output;
   return parameters;
 }
 

@@ -12,7 +12,7 @@ namespace metaekf::meta {
 ///
 /// A long ARX model gives the impulse response, its Hankel matrix the balanced realisation of order n_ψ (Kung's method);
 /// latents are scaled to unit standard deviation on the recording. L, B and the output decoder take the realisation,
-/// 𝓐 keeps the random start of `seed`, its last layer multiplied by `network_scale`.
+/// 𝓐 keeps the random start of `seed`.
 ///
 /// @param normalised  in normalised units. Needs a linear bypass and linear output decoder.
 /// Errors: FailedPrecondition if the recording is too short; InvalidArgument if the model has another form.

@@ -10,6 +10,7 @@
 #include "core/base/rng.h"
 #include "core/base/status.h"
 #include "core/meta/adam.h"
+#include "core/meta/linear_state_start.h"
 #include "core/meta/meta_gradient.h"
 
 namespace metaekf::meta {
@@ -196,8 +197,9 @@ class Schedule {
 
 /// Variables of a start and all that the outer loop keeps beside them.
 std::map<std::string, std::vector<double>> FreshValues(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
-                                                       int32_t start) {
-  std::vector<double> variables = model.InitialParameters(spec.seed ^ (static_cast<uint64_t>(start) << 32));
+                                                       const Systems& systems, int32_t start) {
+  const uint64_t seed = spec.seed ^ (static_cast<uint64_t>(start) << 32);
+  std::vector<double> variables = spec.linear_start ? *LinearStateStart(model, systems.training, seed) : model.InitialParameters(seed);
   if (spec.inner_loop.learned_rates) {
     const std::vector<double> rates = RatesOfTensors(spec.inner_loop, model.layout());
     for (size_t i = 0; i < mask.size(); ++i) {
@@ -308,7 +310,7 @@ class OuterLoop {
     good_.reset();
     if (!last) {
       state_->best_validation_loss = state_->validation_loss = std::numeric_limits<double>::infinity();
-      values = FreshValues(spec_, model_, mask_, start + 1);
+      values = FreshValues(spec_, model_, mask_, systems_, start + 1);
       values.merge(best);
       return;
     }
@@ -402,8 +404,9 @@ class OuterLoop {
 };
 
 /// A state to begin with, or to go on from if it has what the loop needs.
-absl::Status Prepare(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask, TrainingState* state) {
-  const std::map<std::string, std::vector<double>> fresh = FreshValues(spec, model, mask, 0);
+absl::Status Prepare(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask, const Systems& systems, TrainingState* state) {
+  if (spec.linear_start) METAEKF_RETURN_IF_ERROR(base::Annotate(CheckLinearStateStart(model.spec()), "linear_start"));
+  const std::map<std::string, std::vector<double>> fresh = FreshValues(spec, model, mask, systems, 0);
   if (state->values.empty()) {
     state->values = fresh;
     state->best_validation_loss = state->validation_loss = std::numeric_limits<double>::infinity();
@@ -425,7 +428,7 @@ absl::StatusOr<LearnedStart> RunOuterLoop(const TrainingSpec& spec, const nssm::
     return absl::InvalidArgumentError(
         "restarts: there is no system to choose among starts by; a larger validation_share holds some out");
   }
-  METAEKF_RETURN_IF_ERROR(Prepare(spec, model, mask, state));
+  METAEKF_RETURN_IF_ERROR(Prepare(spec, model, mask, systems, state));
   METAEKF_RETURN_IF_ERROR(spec.model.precision == nssm::Precision::kFloat32
                               ? OuterLoop<float>(spec, model, mask, systems, executor, state).Run(on_step)
                               : OuterLoop<double>(spec, model, mask, systems, executor, state).Run(on_step));

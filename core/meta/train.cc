@@ -91,7 +91,8 @@ absl::StatusOr<std::vector<double>> SharedParameters(const TrainingSpec& spec, c
 
 /// What a filter of a system is calibrated on: at most so many samples behind its context, fewer the more there is to be found, or all
 /// of a recording that is hardly longer than that.
-constexpr int64_t kCalibrationSamples = 2000, kCalibrationValues = 12000, kFewSamples = 50;
+constexpr int64_t kCalibrationSamples = 2000, kFewSamples = 50;
+constexpr double kCalibrationWork = 16000;  // samples of one channel; a search over n channels takes some n^1.5 times as long
 
 /// Default Q, R and P₀ from the residuals of the model adapted to each of `systems`, Q and R scaled to what filters of these systems
 /// meet after the context (filter::Calibrate).
@@ -106,7 +107,8 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const Trai
     // An adaptation that diverges says nothing about noise; the unadapted model stands in.
     parameters[i] = adapted.ok() ? *std::move(adapted) : bundle.parameters;
   });
-  const int64_t most = std::clamp(kCalibrationValues / (spec.model.state_size + spec.model.output_size), kFewSamples, kCalibrationSamples);
+  const double channels = spec.model.state_size + spec.model.output_size;
+  const int64_t most = std::clamp(static_cast<int64_t>(kCalibrationWork / std::pow(channels, 1.5)), kFewSamples, kCalibrationSamples);
   filter::NoiseEstimate noise(bundle);
   std::vector<filter::CalibrationRun> runs;
   for (size_t i = 0; i < systems.size(); ++i) {

@@ -1,6 +1,7 @@
 #include "core/meta/training_spec.h"
 
 #include "core/base/status.h"
+#include "core/meta/linear_state_start.h"
 
 namespace metaekf::meta {
 namespace {
@@ -151,6 +152,16 @@ void CheckCurvatureRates(const TrainingSpec& spec, JsonFields* fields) {
                                                  " iterations if there are curvature_rates, which begin after the warm-up"));
 }
 
+/// Whether the model has the form of one that starts linear.
+void CheckLinearStart(const TrainingSpec& spec, JsonFields* fields) {
+  if (!spec.linear_start) return;
+  const absl::Status status = CheckLinearStateStart(spec.model);
+  if (!status.ok()) fields->Fail("linear_start", std::string(status.message()));
+  if (spec.algorithm == Algorithm::kGaussianPrior && spec.gaussian_prior.meta_iterations == 0) {
+    fields->Fail("linear_start", "GAUSSIAN_PRIOR needs gaussian_prior.meta_iterations that begin there");
+  }
+}
+
 /// Whether there is something to choose among several starts by.
 void CheckRestarts(const TrainingSpec& spec, JsonFields* fields) {
   if (spec.restarts == 1) return;
@@ -192,6 +203,8 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
   spec.context_samples = positive("context_samples", spec.context_samples);
   spec.target_samples = positive("target_samples", spec.target_samples);
   spec.contexts_at_start = fields.Bool("contexts_at_start", spec.contexts_at_start);
+  spec.linear_start = fields.Bool("linear_start", spec.linear_start);
+  CheckLinearStart(spec, &fields);
   spec.task_batch = positive("task_batch", spec.task_batch);
   spec.iterations = positive("iterations", spec.iterations);
   spec.restarts = positive("restarts", spec.restarts);
@@ -233,6 +246,7 @@ json ToJson(const TrainingSpec& spec) {
           {"context_samples", spec.context_samples},
           {"target_samples", spec.target_samples},
           {"contexts_at_start", spec.contexts_at_start},
+          {"linear_start", spec.linear_start},
           {"task_batch", spec.task_batch},
           {"iterations", spec.iterations},
           {"restarts", spec.restarts},

@@ -59,6 +59,7 @@ struct TrainingSpec {
   int32_t context_samples = 100;
   int32_t target_samples = 100;
   bool contexts_at_start = false;
+  bool linear_start = false;
   int32_t task_batch = 8;
   int32_t iterations = 1000;
   int32_t restarts = 1;

@@ -55,6 +55,13 @@ size_t ParameterLayout::Add(std::string name, int32_t out, int32_t in, bool is_b
   return tensors_.size() - 1;
 }
 
+TensorMap TensorIn(const ParameterLayout& layout, const std::string& name, std::span<double> parameters) {
+  for (const Tensor& tensor : layout.tensors()) {
+    if (tensor.name == name) return TensorMap(parameters.data() + tensor.offset, tensor.out, tensor.in);
+  }
+  return TensorMap(nullptr, 0, 0);
+}
+
 absl::StatusOr<Mask> ParseMask(const std::string& text, const ParameterLayout& layout) {
   Mask mask(layout.tensors().size(), false);
   const std::vector<std::string> items = absl::StrSplit(text.empty() ? "*" : text, ',');

@@ -1,6 +1,8 @@
 #pragma once
 
+#include <Eigen/Core>
 #include <cstdint>
+#include <span>
 #include <string>
 #include <vector>
 
@@ -34,6 +36,10 @@ class ParameterLayout {
   std::vector<Tensor> tensors_;
   int64_t size_ = 0;
 };
+
+/// The tensor of a name within ω, out × in, to read and to write; 0 × 0 where the layout has none.
+using TensorMap = Eigen::Map<Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>>;
+TensorMap TensorIn(const ParameterLayout& layout, const std::string& name, std::span<double> parameters);
 
 /// Which tensors adapt: one flag per tensor of a layout.
 using Mask = std::vector<bool>;

@@ -70,18 +70,11 @@ int32_t Model::start_size() const {
 int32_t Model::EncodedStartSize() const { return start_size() + 2 * static_cast<int32_t>(spec_.angles.states.size()); }
 
 void Model::StartWithExactReconstruction(std::span<double> parameters) const {
-  using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
-  const auto weight = [&](const std::string& name) {
-    for (const nn::Tensor& tensor : layout_.tensors()) {
-      if (tensor.name == name) return Eigen::Map<RowMajor>(parameters.data() + tensor.offset, tensor.out, tensor.in);
-    }
-    return Eigen::Map<RowMajor>(nullptr, 0, 0);
-  };
   // Where there are latents enough, sines, cosines and inputs leave what is decoded alone.
-  const Eigen::MatrixXd encoder = weight("encoder.0.weight");
+  const Eigen::MatrixXd encoder = nn::TensorIn(layout_, "encoder.0.weight", parameters);
   const Eigen::MatrixXd seen = encoder.cols() <= encoder.rows() ? encoder : Eigen::MatrixXd(encoder.leftCols(spec_.state_size));
   const Eigen::MatrixXd inverse = linalg::SolveLeastSquares(seen, Eigen::MatrixXd::Identity(seen.rows(), seen.rows()));
-  weight("state_decoder.0.weight") = inverse.topRows(spec_.state_size);
+  nn::TensorIn(layout_, "state_decoder.0.weight", parameters) = inverse.topRows(spec_.state_size);
 }
 
 std::vector<double> Model::InitialParameters(uint64_t seed) const {

@@ -17,6 +17,7 @@ using Eigen::VectorXd;
 namespace {
 
 constexpr double kAwake = 0.5;  // what a ray's coordinate begins with at least, for its ReLU to have a slope
+constexpr double kUnique = 1e-8;
 
 std::vector<double> Elements(const MatrixXd& matrix) { return {matrix.data(), matrix.data() + matrix.size()}; }
 
@@ -84,7 +85,9 @@ void PolyhedralLayer::Initialise(const nn::ParameterLayout& layout, std::span<do
   all << rays_.generators, vertices, free_.generators;
   const MatrixXd inverse = linalg::SolveLeastSquares(all, MatrixXd::Identity(n, n));
   VectorXd at_zero = inverse * -middle;
-  at_zero.head(r) = at_zero.head(r).cwiseMax(kAwake);
+  // Of independent generators a point of the set has one set of coordinates, none of them below zero. Else what the inverse gives may be.
+  const bool unique = v == 0 && (inverse * all - MatrixXd::Identity(r + l, r + l)).cwiseAbs().maxCoeff() < kUnique;
+  if (!unique) at_zero.head(r) = at_zero.head(r).cwiseMax(kAwake);
   if (r > 0) Write(layout, rays_.weight, rays_.bias, inverse, at_zero, 0, parameters);
   if (v > 0) Write(layout, vertices_.weight, vertices_.bias, inverse, at_zero, r, parameters);
   if (l > 0) Write(layout, free_.weight, free_.bias, inverse, at_zero, r + v, parameters);

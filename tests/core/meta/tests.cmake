@@ -5,6 +5,7 @@ metaekf_test(core/meta/empirical_bayes_test.cc TIMEOUT 600 DEPS metaekf::core_me
 metaekf_test(core/meta/implicit_gradient_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/known_answers_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/levenberg_marquardt_test.cc DEPS metaekf::core_meta)
+metaekf_test(core/meta/linear_state_start_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/map_fit_test.cc DEPS metaekf::core_meta)
 metaekf_test(core/meta/meta_gradient_test.cc TIMEOUT 600 DEPS metaekf::core_meta)
 metaekf_test(core/meta/meta_memory_test.cc DEPS metaekf::core_meta)

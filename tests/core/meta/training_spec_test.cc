@@ -106,5 +106,18 @@ TEST(TrainingSpecTest, WhatAnAlgorithmCannotUseIsRefusedByName) {
   expect_refused({{"gaussian_prior", {{"covariance", "DIAGONAL"}}}}, "gaussian_prior.covariance");
 }
 
+TEST(TrainingSpecTest, ALinearStartNeedsAModelThatHasOne) {
+  const json block = {{"bypass", "LINEAR"}};
+  const json model = {{"case", "STATE_INPUT_OUTPUT"}, {"latent_size", 5}, {"transition", block}};
+  const auto spec = ReadTrainingSpec({{"model", model}, {"linear_start", true}});
+  ASSERT_TRUE(spec.ok()) << spec.status();
+  EXPECT_TRUE(spec->linear_start);
+  EXPECT_EQ(ToJson(*ReadTrainingSpec(ToJson(*spec))), ToJson(*spec));
+  const auto wrong = ReadTrainingSpec(WithModel({{"linear_start", true}}));
+  EXPECT_NE(std::string(wrong.status().message()).find("linear_start: a linear start needs states"), std::string::npos) << wrong.status();
+  const auto none = ReadTrainingSpec({{"model", model}, {"linear_start", true}, {"algorithm", "GAUSSIAN_PRIOR"}});
+  EXPECT_NE(std::string(none.status().message()).find("meta_iterations"), std::string::npos) << none.status();
+}
+
 }  // namespace
 }  // namespace metaekf::meta

@@ -80,6 +80,9 @@ v1::TrainingSpec FullSpec() {
                                model.mutable_output_decoder()}) {
     block->set_activation(v1::BlockSpec::SWISH);  // the only one with a beta
   }
+  model.mutable_encoder()->clear_hidden_widths();  // as linear_start has them
+  model.mutable_state_decoder()->clear_hidden_widths();
+  model.set_latent_size(model.state_size() + model.input_size() + 2);
   auto* polyhedron = model.mutable_state_constraint()->mutable_polyhedron();
   polyhedron->clear_rays();  // stand instead of the others
   while (polyhedron->matrix_size() < static_cast<int>(model.state_size())) polyhedron->add_matrix(-1);  // whole rows
@@ -127,11 +130,11 @@ TEST(SpecTest, TheFieldsOfCaseOneComeBackToo) {
 
 TEST(SpecTest, WhatCoreRefusesIsAViolationOfTheField) {
   v1::TrainingSpec message = FullSpec();
-  message.mutable_model()->mutable_encoder()->set_hidden_widths(1, 0);
+  message.mutable_model()->mutable_output_decoder()->set_hidden_widths(1, 0);
   const absl::Status status = ToCore("header.spec", message).status();
   EXPECT_EQ(status.code(), absl::StatusCode::kInvalidArgument);
   EXPECT_THAT(std::string(status.message()),
-              StartsWith("header.spec.model.encoder.hidden_widths[1]: "));
+              StartsWith("header.spec.model.output_decoder.hidden_widths[1]: "));
 }
 
 TEST(SpecTest, ErrorsWithoutAPathAreTheWholeField) {
