@@ -24,7 +24,7 @@ absl::Status WriteText(const std::string& directory, const std::string& name, co
 
 const std::vector<Experiment>& Experiments() {
   static const std::vector<Experiment> experiments = {VanDerPolComparison(), BoucWenTables(), FewShotCurve(),
-                                                      AnilHeatmap(), Localization(), VaporCompressionStudy()};
+                                                      AnilHeatmap(), Localization(), VaporCompressionStudy(), Calibration()};
   return experiments;
 }
 

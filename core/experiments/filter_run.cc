@@ -1,5 +1,6 @@
 #include "core/experiments/filter_run.h"
 
+#include <algorithm>
 #include <memory>
 #include <utility>
 
@@ -29,15 +30,22 @@ absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const st
   const std::shared_ptr<const filter::FilterModel::Parameters> parameters = functions->Prepare(model.parameters);
   const std::unique_ptr<filter::FilterModel::Scratch> scratch = functions->MakeScratch();
   const data::Normaliser& units = model.normaliser;
-  const Index n = units.states.scale.size(), count = recording.length() - from;
-  VectorXd first(n);
-  MatrixXd F(n, n);
-  functions->Transition(*parameters, units.states.Normalise(recording.states.col(from - 1)),
-                        units.inputs.Normalise(recording.inputs.col(from - 1)), &first, &F, scratch.get());
-  options.initial_mean = first.cwiseProduct(units.states.scale) + units.states.mean;
-  options.initial_cov = options.process_cov.value_or(model.noise.process);
+  const bool case_one = model.model.spec().is_case_one();
+  if (!case_one) {
+    const Index states = units.states.scale.size();
+    VectorXd first(states);
+    MatrixXd F(states, states);
+    functions->Transition(*parameters, units.states.Normalise(recording.states.col(from - 1)),
+                          units.inputs.Normalise(recording.inputs.col(from - 1)), &first, &F, scratch.get());
+    options.initial_mean = first.cwiseProduct(units.states.scale) + units.states.mean;
+    options.initial_cov = options.process_cov.value_or(model.noise.process);
+  }
   METAEKF_ASSIGN_OR_RETURN(filter::Ekf ekf, filter::Ekf::Create(model, functions, parameters, options));
   filter::Estimate estimate = ekf.MakeEstimate();
+  const Index n = estimate.mean.size(), count = recording.length() - from;
+  for (Index t = case_one ? std::max<Index>(0, from - model.model.spec().warmup()) : from; t < from; ++t) {
+    METAEKF_RETURN_IF_ERROR(ekf.Step(recording.inputs.col(t), recording.outputs.col(t), scratch.get(), &estimate));
+  }
   FilterRun run{.means = MatrixXd(n, count), .deviations = MatrixXd(n, count), .nis = VectorXd(count), .projection = VectorXd(count)};
   const double begin = ThreadSeconds();
   for (Index t = 0; t < count; ++t) {

@@ -23,10 +23,11 @@ struct FilterRun {
 /// Errors: those of meta::Adapt.
 absl::StatusOr<nssm::Bundle> AdaptForFilter(const nssm::Bundle& model, const data::Trajectory& recording, int64_t context_samples);
 
-/// Estimates the states of a model of Case II in `recording` from sample `from` on, where the samples before are the context, whose
-/// states were measured: the filter begins there with x⁻ = f(x_{from−1}, u_{from−1}) and P⁻ = Q.
+/// Estimates states (Case I: outputs) in `recording` from sample `from` on, where the samples before are the context. Its states were
+/// measured in Case II: the filter begins there with x⁻ = f(x_{from−1}, u_{from−1}) and P⁻ = Q. In Case I the context's last samples
+/// fill its window.
 ///
-/// @param model  with the parameters and the noise that the filter is to use. @param functions  of its architecture. @param recording  n_x states and T samples.
+/// @param model  with the parameters and the noise that the filter is to use. @param functions  of its architecture. @param recording  T samples; n_x states in Case II.
 /// @param from  at least 1. @param options  of the filter, without its beginning.
 /// Errors: those of filter::Ekf.
 absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,

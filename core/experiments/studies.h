@@ -22,4 +22,7 @@ Experiment Localization();
 /// Refrigeration cycles whose pressures fall along the flow (paper.tex sec. vapor compression).
 Experiment VaporCompressionStudy();
 
+/// Whether bounds of all of these systems hold what they say. Beyond the paper.
+Experiment Calibration();
+
 }  // namespace metaekf::experiments
