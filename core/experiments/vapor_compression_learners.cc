@@ -9,35 +9,38 @@ namespace {
 using nlohmann::json;
 
 /// What all have. States are measured in training and context; the linear start is in the fleet's principal coordinates. The network
-/// learns from rollouts of five steps: from single ones it learns nothing of how errors go on, and the filter lives on that.
+/// learns from rollouts of five steps at first, then of twenty: from single ones it learns nothing of how errors go on, and the filter
+/// lives on that. The reconstruction's weight keeps the autoencoder exact enough to project by.
 constexpr char kCommon[] = R"json({
   "model": {
     "case": "STATE_INPUT_OUTPUT", "latent_size": 26, "precision": "FLOAT32",
     "transition": {"form": "AUTONOMOUS", "bypass": "LINEAR", "increment_scale": 0.05,
                    "block": {"hidden_widths": [64, 64, 32], "activation": "SWISH"}}
   },
-  "loss": {"horizon": 5, "stride": 5, "rollout": "STATE", "state_weight": 300, "reconstruction_weight": 100},
+  "loss": {"horizon": 20, "stride": 20, "rollout": "STATE", "state_weight": 300, "reconstruction_weight": 100},
   "linear_start": true, "context_samples": 200, "target_samples": 400, "contexts_at_start": true, "validation_share": 0.1,
-  "clip_norm": 2, "validation_period": 100, "warmup_horizon": 5
+  "clip_norm": 2, "validation_period": 100, "warmup_horizon": 5, "warmup_lr": 0.001, "outer_lr": 0.0003, "final_outer_lr": 1e-5
 })json";
 
 constexpr char kMaml[] = R"json({
-  "algorithm": "MAML", "task_batch": 4, "iterations": 32000, "warmup_iterations": 30000, "warmup_lr": 0.001, "outer_lr": 0.0003, "final_outer_lr": 1e-5,
+  "algorithm": "MAML", "task_batch": 4, "iterations": 27000, "warmup_iterations": 24000, "horizon_growth_iterations": 1000,
   "inner_loop": {"steps": 10, "learning_rate": 0.5, "learned_rates": true, "curvature_rates": true, "adapted_mask": "transition.3.weight"},
   "adaptation": {"steps": 10}
 })json";
 
 constexpr char kUniversal[] = R"json({
-  "algorithm": "SUPERVISED", "task_batch": 8, "iterations": 40000, "outer_lr": 0.001, "final_outer_lr": 1e-5,
+  "algorithm": "SUPERVISED", "task_batch": 8, "iterations": 30000, "warmup_iterations": 24000, "horizon_growth_iterations": 2000,
   "inner_loop": {"steps": 1}, "adaptation": {"steps": 0}
 })json";
 
 /// Of a quick study.
-constexpr char kShort[] = R"json({"iterations": 2300, "warmup_iterations": 2000})json";
-constexpr char kShortUniversal[] = R"json({"iterations": 2500})json";
+constexpr char kShort[] = R"json({"iterations": 2400, "warmup_iterations": 2000, "horizon_growth_iterations": 150})json";
+constexpr char kShortUniversal[] = R"json({"iterations": 2600, "warmup_iterations": 2000, "horizon_growth_iterations": 200})json";
 /// To see that everything runs.
-constexpr char kTiny[] = R"json({"iterations": 8, "warmup_iterations": 4, "task_batch": 2, "target_samples": 60, "context_samples": 60, "validation_period": 4, "validation_share": 0.2})json";
-constexpr char kTinyUniversal[] = R"json({"iterations": 6, "task_batch": 2, "target_samples": 60, "context_samples": 60, "validation_period": 4, "validation_share": 0.2})json";
+constexpr char kTiny[] = R"json({
+  "iterations": 8, "warmup_iterations": 4, "horizon_growth_iterations": 2, "task_batch": 2, "target_samples": 60, "context_samples": 60,
+  "validation_period": 4, "validation_share": 0.2
+})json";
 
 json Merged(json a, const json& b) {
   a.merge_patch(b);
@@ -62,12 +65,12 @@ std::vector<double> PressureOrder() {
 
 std::vector<Learner> VaporCompressionLearners(Budget budget) {
   const json order = {{"model", {{"state_constraint", {{"polyhedron", {{"matrix", PressureOrder()}}}}}}}};
-  const auto shortened = [budget](json recipe, const char* quick, const char* tiny) {
+  const auto shortened = [budget](json recipe, const char* quick) {
     if (budget == Budget::kQuick) return Merged(std::move(recipe), Parsed(quick));
-    return budget == Budget::kTiny ? Merged(std::move(recipe), Parsed(tiny)) : recipe;
+    return budget == Budget::kTiny ? Merged(std::move(recipe), Parsed(kTiny)) : recipe;
   };
-  const json maml = Merged(Parsed(kCommon), shortened(Parsed(kMaml), kShort, kTiny));
-  const json universal = Merged(Parsed(kCommon), shortened(Parsed(kUniversal), kShortUniversal, kTinyUniversal));
+  const json maml = Merged(Parsed(kCommon), shortened(Parsed(kMaml), kShort));
+  const json universal = Merged(Parsed(kCommon), shortened(Parsed(kUniversal), kShortUniversal));
   std::vector<Learner> learners;
   for (const auto& [label, recipe] : {std::pair{kVaporMaml, maml}, {kVaporUniversal, universal}}) {
     learners.push_back({label, TrainingData::kFleet, Merged(recipe, order)});
