@@ -17,85 +17,6 @@ using Eigen::VectorXd;
 
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 
-TEST(FilterModelTest, JacobiansMatchCentralDifferencesForEveryKindOfModel) {
-  for (const nssm::ModelCase& c : nssm::ModelCases()) {
-    SCOPED_TRACE(c.name);
-    const nssm::Model model = *nssm::Model::Create(c.model);
-    const auto filter_model = FilterModel::Create(nssm::Bundle{.model = model});
-    const auto parameters = filter_model->Prepare(nssm::RandomParameters(model, 5));
-    const auto scratch = filter_model->MakeScratch();
-    const Eigen::Index n = filter_model->state_size(), n_y = c.model.output_size;
-    base::Rng rng(9);
-    const VectorXd x = RandomVector(&rng, n), u = RandomVector(&rng, c.model.input_size);
-    VectorXd f(n), f_up(n), f_down(n), h(n_y), h_up(n_y), h_down(n_y);
-    MatrixXd F(n, n), H(n_y, n), ignored(std::max(n, n_y), n);
-    filter_model->Transition(*parameters, x, u, &f, &F, scratch.get());
-    filter_model->Measurement(*parameters, x, u, &h, &H, scratch.get());
-    const double step = 1e-6;
-    for (Eigen::Index j = 0; j < n; ++j) {
-      VectorXd up = x, down = x;
-      up[j] += step;
-      down[j] -= step;
-      MatrixXd unused_F(n, n), unused_H(n_y, n);
-      filter_model->Transition(*parameters, up, u, &f_up, &unused_F, scratch.get());
-      filter_model->Transition(*parameters, down, u, &f_down, &unused_F, scratch.get());
-      filter_model->Measurement(*parameters, up, u, &h_up, &unused_H, scratch.get());
-      filter_model->Measurement(*parameters, down, u, &h_down, &unused_H, scratch.get());
-      EXPECT_LT((F.col(j) - (f_up - f_down) / (2 * step)).norm(), 1e-7 * (1 + F.norm()));
-      EXPECT_LT((H.col(j) - (h_up - h_down) / (2 * step)).norm(), 1e-7 * (1 + H.norm()));
-    }
-    if (c.model.is_curl_free()) {
-      // Positions are states 1 and 0 in that order: curl = ∂h₀/∂x₀ − ∂h₁/∂x₁ of the listed components.
-      EXPECT_NEAR(H(0, 0), H(1, 1), 1e-12 * (1 + H.norm()));
-    }
-  }
-}
-
-// In two dimensions and three, for every smooth activation, at all sizes of weights and states: ∂h_i/∂p_j = ∂h_j/∂p_i, in the EKF's exact H
-// and in central differences of h.
-TEST(FilterModelTest, ACurlFreeFieldHasASymmetricJacobianEverywhere) {
-  using autodiff::Activation;
-  double worst = 0;
-  for (const Activation activation : {Activation::kSwish, Activation::kTanh, Activation::kMish, Activation::kSoftplus}) {
-    for (const std::vector<int32_t>& positions : {std::vector<int32_t>{0, 2}, {3, 0, 1}}) {
-      const nn::BlockSpec block{.hidden_widths = {8, 6}, .activation = activation};
-      nssm::ModelSpec spec{.kind = nssm::Case::kStateInputOutput, .input_size = 1, .output_size = static_cast<int32_t>(positions.size()),
-                           .state_size = 4, .latent_size = 5, .window = 1};
-      spec.encoder = spec.output_decoder = block;
-      spec.curl_free_positions = positions;
-      spec.precision = nssm::Precision::kFloat64;
-      const nssm::Model model = *nssm::Model::Create(spec);
-      const auto filter_model = FilterModel::Create(nssm::Bundle{.model = model});
-      const auto scratch = filter_model->MakeScratch();
-      base::Rng rng(3);
-      const Eigen::Index d = spec.output_size;
-      VectorXd h(d), up(d), down(d);
-      MatrixXd H(d, 4), unused(d, 4);
-      for (int trial = 0; trial < 200; ++trial) {
-        std::vector<double> parameters = nssm::RandomParameters(model, static_cast<uint64_t>(trial));
-        const double size = std::pow(10.0, rng.Uniform(-1, 0.5));
-        for (double& value : parameters) value *= size;
-        const auto prepared = filter_model->Prepare(parameters);
-        const VectorXd x = std::pow(10.0, rng.Uniform(-2, 1)) * RandomVector(&rng, 4), u = RandomVector(&rng, 1);
-        filter_model->Measurement(*prepared, x, u, &h, &H, scratch.get());
-        const MatrixXd J = H(Eigen::all, positions);
-        if (J.norm() == 0) continue;
-        worst = std::max(worst, (J - J.transpose()).norm() / J.norm());
-        MatrixXd differences(d, d);
-        constexpr double kStep = 1e-5;
-        for (Eigen::Index j = 0; j < d; ++j) {
-          const VectorXd step = kStep * VectorXd::Unit(4, positions[static_cast<size_t>(j)]);
-          filter_model->Measurement(*prepared, x + step, u, &up, &unused, scratch.get());
-          filter_model->Measurement(*prepared, x - step, u, &down, &unused, scratch.get());
-          differences.col(j) = (up - down) / (2 * kStep);
-        }
-        EXPECT_LT((differences - J).norm(), 1e-6 * (J.norm() + h.norm()) + 1e-9) << trial;  // what rounding leaves of a difference
-      }
-    }
-  }
-  EXPECT_LT(worst, 1e-12);
-}
-
 // Oracle: the exact Kalman filter with textbook formulas, with missing components and wholly missing samples.
 TEST(EkfTest, EqualsTheKalmanFilterOnALinearSystem) {
   const LinearSystem s;
@@ -246,97 +167,6 @@ TEST(EkfTest, IsConsistentWithTheSystemThatItKnows) {
   EXPECT_LT(unhealthy, samples / 200);
 }
 
-TEST(EkfTest, OutliersAreLeftOutComponentByComponent) {
-  const nssm::Bundle bundle = LinearBundle(LinearSystem());
-  Filter filter(bundle), without(bundle);
-  LinearTruth truth(LinearSystem(), 5);
-  for (int t = 0; t < 200; ++t) {
-    const VectorXd u = RandomVector(&truth.rng, 1);
-    VectorXd y = truth.Measure(), spared = y;
-    if (t % 20 == 10) {
-      y[1] += 1e4;
-      spared[1] = kNaN;
-    }
-    ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
-    ASSERT_TRUE(without.ekf.Step(u, spared, without.scratch.get(), &without.estimate).ok());
-    EXPECT_EQ(filter.estimate.gated, t % 20 == 10 ? 1 : 0);
-    if (t % 20 == 10) {
-      EXPECT_GT(filter.estimate.nis, 1e4);
-      EXPECT_GT(filter.estimate.innovation[1], 9e3);
-    }
-    // As if the wrong component had not been measured.
-    EXPECT_LT((filter.estimate.mean - without.estimate.mean).norm(), 1e-12);
-    EXPECT_LT((filter.estimate.cov - without.estimate.cov).norm(), 1e-12);
-    EXPECT_EQ(filter.estimate.health, Health::kConsistent);
-    truth.Advance(u[0]);
-  }
-}
-
-TEST(EkfTest, AJumpIsBelievedAfterFiveSamples) {
-  const nssm::Bundle bundle = LinearBundle(LinearSystem());
-  Filter filter(bundle);
-  LinearTruth truth(LinearSystem(), 6);
-  std::vector<int> gated_at, reset_at;
-  for (int t = 0; t < 140; ++t) {
-    if (t == 100) truth.state[0] += 1000;  // someone has carried the system elsewhere
-    const VectorXd u = RandomVector(&truth.rng, 1);
-    ASSERT_TRUE(filter.ekf.Step(u, truth.Measure(), filter.scratch.get(), &filter.estimate).ok());
-    if (filter.estimate.gated > 0) gated_at.push_back(t);
-    if (filter.estimate.reset) {
-      reset_at.push_back(t);
-      EXPECT_LT((filter.estimate.mean - truth.state).norm(), 5);
-      EXPECT_EQ(filter.estimate.health, Health::kOverconfident);
-    }
-    truth.Advance(u[0]);
-  }
-  EXPECT_EQ(gated_at, (std::vector<int>{100, 101, 102, 103, 104}));
-  EXPECT_EQ(reset_at, std::vector<int>{105});
-}
-
-TEST(EkfTest, AnOverconfidentFilterDoesNotLockMeasurementsOut) {
-  nssm::Bundle bundle = LinearBundle(LinearSystem());
-  bundle.noise.process *= 1e-4;
-  bundle.noise.measurement *= 1e-4;  // a hundredth of the true deviations
-  Filter filter(bundle);
-  LinearTruth truth(LinearSystem(), 7);
-  int gated = 0;
-  double squares = 0;
-  for (int t = 0; t < 600; ++t) {
-    const VectorXd u = RandomVector(&truth.rng, 1);
-    ASSERT_TRUE(filter.ekf.Step(u, truth.Measure(), filter.scratch.get(), &filter.estimate).ok());
-    if (t >= 100) {
-      gated += filter.estimate.gated;
-      squares += (filter.estimate.mean - truth.state).squaredNorm();
-      EXPECT_EQ(filter.estimate.health, Health::kOverconfident);
-    }
-    truth.Advance(u[0]);
-  }
-  EXPECT_LE(gated, 10);
-  EXPECT_LT(std::sqrt(squares / 500), 1);
-}
-
-TEST(EkfTest, BeginsAnewAfterADivergenceUnlessToldNotTo) {
-  for (const bool restart : {true, false}) {
-    nssm::Bundle bundle = LinearBundle(LinearSystem());
-    Filter filter(bundle, {.gate = {.probability = 0}, .restart_after_divergence = restart});
-    const VectorXd u{{0.1}}, y{{0.2, 0.1}};
-    ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
-    const VectorXd first = filter.estimate.mean;
-    ASSERT_TRUE(filter.ekf.Step(VectorXd{{1e308}}, y, filter.scratch.get(), &filter.estimate).ok());
-    ASSERT_TRUE(filter.ekf.Step(VectorXd{{1e308}}, VectorXd{{1e308, -1e308}}, filter.scratch.get(), &filter.estimate).ok());
-    for (int t = 0; t < 5 && filter.estimate.health != Health::kDiverged; ++t) {
-      ASSERT_TRUE(filter.ekf.Step(VectorXd{{1e308}}, VectorXd{{1e308, -1e308}}, filter.scratch.get(), &filter.estimate).ok());
-    }
-    ASSERT_EQ(filter.estimate.health, Health::kDiverged);
-    ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
-    EXPECT_EQ(filter.estimate.reset, restart);
-    EXPECT_EQ(filter.estimate.health, restart ? Health::kConsistent : Health::kDiverged);
-    if (restart) {
-      EXPECT_EQ(filter.estimate.mean, first);
-    }
-  }
-}
-
 TEST(EkfTest, ASampleMayBringItsOwnNoise) {
   const LinearSystem system;
   const nssm::Bundle bundle = LinearBundle(system);
@@ -402,36 +232,6 @@ TEST(EkfTest, WrongNoiseIsRefusedByName) {
   EXPECT_NE(message({.gate = {.recover_after = 0}}).find("gate"), std::string::npos);
 }
 
-// Weights and measurements of any size, in float and double: whatever the filter makes of them, what it says is inside.
-TEST(EkfTest, EstimatesOfConstrainedStatesAreInsideWhateverTheWeights) {
-  int64_t estimates = 0, projected = 0;
-  for (uint64_t seed = 0; seed < 2600; ++seed) {
-    base::Rng rng(seed);
-    for (nssm::ModelCase c : nssm::ModelCases()) {
-      if (c.name != "Case II, ordered states") continue;
-      if (seed % 2 == 0) c.model.precision = nssm::Precision::kFloat32;
-      c.model.state_set.mean = 10 * RandomVector(&rng, 2);
-      c.model.state_set.scale = Eigen::Vector2d(rng.Uniform(0.1, 10), rng.Uniform(0.1, 10));
-      nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(c.model));
-      bundle.normaliser.states = {c.model.state_set.mean, c.model.state_set.scale};
-      const double size = std::pow(10.0, rng.Uniform(-2, 2));
-      for (double& parameter : bundle.parameters) parameter = size * rng.Normal();
-      nssm::RoundToPrecision(c.model.precision, &bundle.parameters);
-      Filter filter(bundle);
-      for (int t = 0; t < 400; ++t) {
-        const VectorXd u = RandomVector(&rng, 1), y = std::pow(10.0, rng.Uniform(-2, 3)) * RandomVector(&rng, 2);
-        ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
-        if (filter.estimate.health == Health::kDiverged) continue;  // it begins anew
-        ASSERT_TRUE(physics::Contains(*bundle.model.state_set(), filter.estimate.mean)) << "seed " << seed << ", step " << t;
-        ++estimates;
-        projected += filter.estimate.projection > 0 ? 1 : 0;
-      }
-    }
-  }
-  EXPECT_GT(estimates, 1000000);
-  EXPECT_GT(projected, 50000);
-}
-
 // On a linear system it does not matter what is linearised about.
 TEST(EkfTest, AStartByLeastSquaresIsTheFiltersOnALinearSystem) {
   const nssm::Bundle bundle = LinearBundle(LinearSystem());
@@ -476,42 +276,6 @@ TEST(EkfTest, TheCovarianceStaysPositiveSemidefiniteForAMillionSteps) {
       }
     }
   }
-}
-
-TEST(EkfTest, TheAutoencoderPutsEstimatesInsideAndTakesTheirCovarianceAlong) {
-  int projected = 0;
-  for (const nssm::ModelCase& c : nssm::ModelCases()) {
-    if (c.name != "Case II, ordered states") continue;
-    for (uint64_t seed = 0; seed < 20; ++seed) {
-      nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(c.model));
-      bundle.parameters = nssm::RandomParameters(bundle.model, seed);
-      Filter filter(bundle, {.projection = Projection::kAutoencoder}), free(bundle, {.projection = Projection::kNone});
-      const auto& set = *bundle.model.state_set();
-      base::Rng rng(seed);
-      for (int t = 0; t < 100; ++t) {
-        const VectorXd u = RandomVector(&rng, 1), y = 3 * RandomVector(&rng, 2);
-        free.ekf.Restore(filter.ekf.state());  // the same step without projection
-        ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
-        ASSERT_TRUE(free.ekf.Step(u, y, free.scratch.get(), &free.estimate).ok());
-        EXPECT_TRUE(physics::Contains(set, filter.estimate.mean));
-        EXPECT_EQ(filter.estimate.slack, free.estimate.slack);
-        EXPECT_EQ(free.estimate.projection, 0);
-        if (filter.estimate.projection == 0) {
-          EXPECT_EQ(filter.estimate.mean, free.estimate.mean);
-          continue;
-        }
-        ++projected;
-        EXPECT_LT(free.estimate.slack, 0);
-        EXPECT_FALSE(physics::Contains(set, free.estimate.mean));
-        VectorXd reconstruction(2);
-        MatrixXd J(2, 2);
-        filter.model->Reconstruct(*filter.model->Prepare(bundle.parameters), free.ekf.state().mean, u, &reconstruction, &J, filter.scratch.get());
-        EXPECT_LT((filter.estimate.mean - reconstruction).norm(), 1e-12 * (1 + reconstruction.norm()));
-        EXPECT_LT((filter.estimate.cov - J * free.estimate.cov * J.transpose()).norm(), 1e-10 * (1 + free.estimate.cov.norm()));
-      }
-    }
-  }
-  EXPECT_GT(projected, 50);
 }
 
 #if METAEKF_COUNTS_ALLOCATIONS
