@@ -34,8 +34,8 @@ constexpr char kUniversal[] = R"json({
 })json";
 
 /// Of a quick study.
-constexpr char kShort[] = R"json({"iterations": 2400, "warmup_iterations": 2000, "horizon_growth_iterations": 150})json";
-constexpr char kShortUniversal[] = R"json({"iterations": 2600, "warmup_iterations": 2000, "horizon_growth_iterations": 200})json";
+constexpr char kShort[] = R"json({"iterations": 6900, "warmup_iterations": 6500, "horizon_growth_iterations": 150})json";
+constexpr char kShortUniversal[] = R"json({"iterations": 8000, "warmup_iterations": 6500, "horizon_growth_iterations": 500})json";
 /// To see that everything runs.
 constexpr char kTiny[] = R"json({
   "iterations": 8, "warmup_iterations": 4, "horizon_growth_iterations": 2, "task_batch": 2, "target_samples": 60, "context_samples": 60,
