@@ -10,6 +10,7 @@
 #include "core/experiments/bouc_wen_learners.h"
 #include "core/experiments/filter_run.h"
 #include "core/experiments/jobs.h"
+#include "core/experiments/localization_data.h"
 #include "core/experiments/localization_learners.h"
 #include "core/experiments/studies.h"
 #include "core/experiments/vapor_compression_learners.h"
@@ -82,12 +83,12 @@ std::vector<Subject> Subjects(const Options& options) {
   add("van der Pol", oscillator, "van-der-pol", {{"noise_std", "0.005"}}, pick(100, 40, 6), pick(2000, 1000, 160), pick(400, 400, 120), pick(3000, 1500, 60));
   add("Bouc–Wen", BoucWenLearners(budget).front(), "bouc-wen", {{"noise_std", "7.5e-6"}}, pick(40, 12, 4), pick(10000, 2048, 300), pick(500, 500, 120), pick(1500, 1500, 60));
   subjects.back().targets.settings["states"] = "1";  // y without noise is one of them
-  const std::map<std::string, std::string> vehicles = {{"noise_std", "0.001"}, {"position_std", "0.005"}, {"heading_std", "0.01"}};
+  const auto vehicles = LocalizationData()["settings"].get<std::map<std::string, std::string>>();
   for (const char* label : {kMamlSwish, kPriorSwish}) {
-    add(absl::StrCat("localization, ", label), Named(LocalizationLearners(budget), label), "magnetic-localization", vehicles, pick(80, 40, 5), 400, 80, 320);
+    add(absl::StrCat("localization, ", label), Named(LocalizationLearners(budget), label), "magnetic-localization", vehicles, pick(80, 40, 5), kLocalizationSamples, kLocalizationContext, kLocalizationSamples - kLocalizationContext);
   }
   add("vapor compression", Named(VaporCompressionLearners(budget), kVaporMaml), "vapor-compression",
-      {{"hold_s", "5"}, {"pressure_noise_std", "1000"}, {"temperature_noise_std", "0.1"}}, pick(100, 20, 5), pick(3000, 1500, 120), pick(200, 200, 60), pick(1500, 600, 60));
+      VaporCompressionSettings(), pick(100, 20, 5), pick(3000, 1500, 120), pick(200, 200, 60), pick(1500, 600, 60));
   return subjects;
 }
 

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <chrono>
+#include <limits>
 #include <memory>
 #include <utility>
 
@@ -82,6 +83,12 @@ absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learn
     trainings.push_back({std::move(bundle), seconds, memory.MiB()});
   }
   return trainings;
+}
+
+void AddCosts(const Training& training, Row* row) {
+  row->cells[0].push_back(training.bundle.ok() ? static_cast<double>(training.bundle->parameters.size()) : std::numeric_limits<double>::infinity());
+  row->cells[1].push_back(training.seconds);
+  row->cells[2].push_back(training.memory_mib);
 }
 
 SystemModel ModelOf(const nssm::Bundle& bundle) {

@@ -45,6 +45,9 @@ absl::StatusOr<std::vector<Training>> TrainAll(const std::vector<Learner>& learn
                                                const data::Trajectory& context, uint64_t seed, base::Executor* executor,
                                                const OnProgress& on_progress);
 
+/// Adds one training to the first three cells of a row: its parameters, seconds and MiB.
+void AddCosts(const Training& training, Row* row);
+
 /// A model of one system, neural or not.
 struct SystemModel {
   int64_t warmup = 0;  ///< samples needed before the first prediction

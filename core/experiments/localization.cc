@@ -162,11 +162,7 @@ Table Times(const Study& study) {
   };
   for (size_t i = 0; i < study.learners.size(); ++i) {
     Row row{study.learners[i].label, {{}, {}, {}, scaled(study.Values(i, &Trial::adaptation_s), 1e3), scaled(study.Values(i, &Trial::step_s), 1e6)}};
-    for (const std::vector<Training>& run : study.trainings) {
-      row.cells[0].push_back(run[i].bundle.ok() ? static_cast<double>(run[i].bundle->parameters.size()) : kInfinity);
-      row.cells[1].push_back(run[i].seconds);
-      row.cells[2].push_back(run[i].memory_mib);
-    }
+    for (const std::vector<Training>& run : study.trainings) AddCosts(run[i], &row);
     table.rows.push_back(std::move(row));
   }
   return table;

@@ -2,7 +2,6 @@
 #include <array>
 #include <cmath>
 #include <limits>
-#include <map>
 #include <optional>
 
 #include "absl/strings/str_cat.h"
@@ -48,11 +47,6 @@ Scale ScaleOf(const Options& options) {
   return scale;
 }
 
-/// What the paper leaves open, settled before any training: inputs are held for 5 s, sensors have noise of 1 kPa and 0.1 K.
-std::map<std::string, std::string> Settings() {
-  return {{"hold_s", "5"}, {"pressure_noise_std", "1000"}, {"temperature_noise_std", "0.1"}};
-}
-
 json Protocol(const Options& options) {
   const Scale scale = ScaleOf(options);
   json learners = json::array();
@@ -60,7 +54,7 @@ json Protocol(const Options& options) {
   return {{"experiment", "vapor-compression"}, {"runs", scale.runs}, {"first_seed", kFirstSeed},
           {"target_seed", absl::StrCat("seed + ", kTargetSeeds)}, {"sources", scale.sources}, {"source_samples", scale.fleet_samples},
           {"targets", scale.targets}, {"target_samples", scale.samples}, {"context_samples", scale.context},
-          {"settings", Settings()}, {"learners", learners}};
+          {"settings", VaporCompressionSettings()}, {"learners", learners}};
 }
 
 /// Ways to put estimates of the adapted model inside its set.
@@ -197,11 +191,7 @@ Table Times(const Study& study) {
     };
     Row row{study.learners[i].label,
             {{}, {}, {}, study.Values(i, [](const Trial& trial) { return 1e3 * trial.adaptation_s; }), step(study.Way(i)), step(kAutoencoder), step(kNotProjected)}};
-    for (const std::vector<Training>& run : study.trainings) {
-      row.cells[0].push_back(run[i].bundle.ok() ? static_cast<double>(run[i].bundle->parameters.size()) : kInfinity);
-      row.cells[1].push_back(run[i].seconds);
-      row.cells[2].push_back(run[i].memory_mib);
-    }
+    for (const std::vector<Training>& run : study.trainings) AddCosts(run[i], &row);
     table.rows.push_back(std::move(row));
   }
   return table;
@@ -325,7 +315,7 @@ VectorXd DeviationsOf(const data::Dataset& fleet) {
 /// Trains everything on one fleet and judges it on its targets.
 absl::Status RunSeed(uint64_t seed, base::Executor* executor, const OnProgress& on_progress, Study* study) {
   const auto request = [&](int64_t systems, uint64_t of, int64_t samples) {
-    return sim::Request{.system = "vapor-compression", .systems = systems, .seed = of, .steps = samples, .settings = Settings()};
+    return sim::Request{.system = "vapor-compression", .systems = systems, .seed = of, .steps = samples, .settings = VaporCompressionSettings()};
   };
   const Scale& scale = study->scale;
   if (on_progress && !on_progress(0, 1, "simulating the fleet")) return absl::CancelledError("the study was cancelled");

@@ -53,6 +53,10 @@ json Parsed(const char* text) { return json::parse(text); }
 
 std::string Unconstrained(const std::string& label) { return absl::StrCat(label, ", unconstrained"); }
 
+std::map<std::string, std::string> VaporCompressionSettings() {
+  return {{"hold_s", "5"}, {"pressure_noise_std", "1000"}, {"temperature_noise_std", "0.1"}};
+}
+
 std::vector<double> PressureOrder() {
   constexpr int kVolumes = sim::kVaporCompressionVolumes, kStates = 3 * kVolumes;
   std::vector<double> matrix(static_cast<size_t>((kVolumes - 1) * kStates), 0.0);

@@ -76,6 +76,17 @@ TEST(PolyhedralLayerTest, BeginsAsTheIdentityFarFromTheEdge) {
   EXPECT_LT((order(z) - physical).cwiseQuotient(physical).cwiseAbs().maxCoeff(), 1e-12);
 }
 
+// Where a point has one set of coordinates, however close to the edge it is: here pressures fall by a hundredth of their deviations.
+TEST(PolyhedralLayerTest, BeginsAsTheIdentityUpToTheEdgeOfAConeWithUniqueCoordinates) {
+  MatrixXd G = MatrixXd::Zero(2, 4);
+  G.topLeftCorner(2, 3) << -1, 1, 0, 0, -1, 1;
+  const Layer close(G, VectorXd::Zero(2), Eigen::Vector4d(1.002e6, 1.001e6, 1e6, 300), Eigen::Vector4d(1e5, 1e5, 1e5, 10));
+  MatrixXd z = 0.5 * Random(4, 20, 1);
+  for (Index k = 0; k < z.cols(); ++k) z.col(k).head(3).setConstant(z(0, k));  // all three rise and fall together
+  const MatrixXd physical = (close.scale.asDiagonal() * z).colwise() + close.mean;
+  EXPECT_LT((close(z) - physical).cwiseQuotient(physical).cwiseAbs().maxCoeff(), 1e-12);
+}
+
 // A softmax bends away from the identity: near its middle it does not yet.
 TEST(PolyhedralLayerTest, BeginsInTheMiddleOfABoxWithTheSlopeOfTheIdentity) {
   const Layer box = Box();
