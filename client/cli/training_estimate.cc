@@ -89,7 +89,7 @@ absl::StatusOr<TrainingEstimate> EstimateTraining(const nlohmann::json& specific
   METAEKF_ASSIGN_OR_RETURN(estimate.duration_s, by_fits ? GaussianPriorSeconds(spec, fleet) : GradientSeconds(spec, fleet));
   if (by_fits && spec.gaussian_prior.meta_iterations > 0) {
     meta::TrainingSpec meta = spec;
-    meta.algorithm = meta::Algorithm::kMaml;
+    meta.algorithm = spec.gaussian_prior.meta_algorithm;
     meta.iterations = spec.gaussian_prior.meta_iterations;
     METAEKF_ASSIGN_OR_RETURN(const double seconds, GradientSeconds(meta, fleet));
     estimate.duration_s += seconds;

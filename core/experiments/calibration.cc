@@ -87,7 +87,7 @@ std::vector<Subject> Subjects(const Options& options) {
   for (const char* label : {kMamlSwish, kPriorSwish}) {
     add(absl::StrCat("localization, ", label), Named(LocalizationLearners(budget), label), "magnetic-localization", vehicles, pick(80, 40, 5), kLocalizationSamples, kLocalizationContext, kLocalizationSamples - kLocalizationContext);
   }
-  add("vapor compression", Named(VaporCompressionLearners(budget), kVaporMaml), "vapor-compression",
+  add("vapor compression", Named(VaporCompressionLearners(budget), kVaporPrior), "vapor-compression",
       VaporCompressionSettings(), pick(100, 20, 5), pick(3000, 1500, 120), pick(200, 200, 60), pick(1500, 600, 60));
   return subjects;
 }

@@ -131,7 +131,7 @@ absl::StatusOr<Trial> RunTrial(const Study& study, size_t learner, const nssm::B
   trial.adaptation_s = ThreadSeconds() - begin;
   const MatrixXd states = recording.states.rightCols(recording.length() - context);
   const size_t usual = study.Way(learner);
-  const bool is_drawn = study.learners[learner].label == kVaporMaml;
+  const bool is_drawn = study.learners[learner].label == kVaporPrior;
   for (size_t way = 0; way < kWays; ++way) {
     if (way != kNotProjected && !study.IsConstrained(learner)) continue;
     METAEKF_ASSIGN_OR_RETURN(FilterRun run, FilterAfterContext(*adapted, functions, recording, context, {.projection = kProjections[way]}));
@@ -200,14 +200,15 @@ Table Times(const Study& study) {
 std::vector<std::string> Findings(const Study& study) {
   const auto ratio = [](double a, double b) { return base::FormatShort(a / b, 3); };
   std::vector<std::string> findings;
-  const size_t maml = study.IndexOf(kVaporMaml);
-  const double adapted = study.MedianError(kVaporMaml);
-  const double unadapted = Summarise(study.Values(maml, [](const Trial& trial) { return trial.unadapted; }), false).median;
-  findings.push_back(absl::StrCat("MAML: median error of the adapted EKF in its ratio to the unadapted one: ", ratio(adapted, unadapted), "."));
-  findings.push_back(absl::StrCat("The same in its ratio to one model for all: ", ratio(adapted, study.MedianError(kVaporUniversal)),
-                                  "; being told the pipe's length has one model for all come to ",
-                                  ratio(study.MedianError(kVaporTold), study.MedianError(kVaporUniversal)), " of its error: what there is to be learned about a system."));
-  for (const char* label : {kVaporMaml, kVaporUniversal}) {
+  const double universal = study.MedianError(kVaporUniversal);
+  for (const char* label : {kVaporPrior, kVaporMaml}) {
+    const double adapted = study.MedianError(label);
+    const double unadapted = Summarise(study.Values(study.IndexOf(label), [](const Trial& trial) { return trial.unadapted; }), false).median;
+    findings.push_back(absl::StrCat(label, ": median error of the adapted EKF in its ratio to the unadapted one: ", ratio(adapted, unadapted),
+                                    ", to one model for all: ", ratio(adapted, universal), "."));
+  }
+  findings.push_back(absl::StrCat("Being told the pipe's length has one model for all come to ", ratio(study.MedianError(kVaporTold), universal), " of its error."));
+  for (const char* label : {kVaporPrior, kVaporUniversal}) {
     findings.push_back(absl::StrCat(label, ": median error of the constrained model in its ratio to the unconstrained: ",
                                     ratio(study.MedianError(label), study.MedianError(Unconstrained(label))), "."));
   }
@@ -224,10 +225,10 @@ absl::StatusOr<Picture> DrawErrors(const Study& study) {
   for (size_t i = 0; i < study.learners.size(); ++i) {
     const std::string& label = study.learners[i].label;
     picture.boxes.push_back({.label = label, .values = study.Errors(i, study.Way(i))});
-    if (label == kVaporMaml) {
-      picture.boxes.push_back({.label = "MAML, unadapted", .values = study.Values(i, [](const Trial& trial) { return trial.unadapted; })});
-      picture.boxes.push_back({.label = "MAML, by autoencoder", .values = study.Errors(i, kAutoencoder)});
-      picture.boxes.push_back({.label = "MAML, not projected", .values = study.Errors(i, kNotProjected)});
+    if (label == kVaporPrior) {
+      picture.boxes.push_back({.label = "unadapted", .values = study.Values(i, [](const Trial& trial) { return trial.unadapted; })});
+      picture.boxes.push_back({.label = "by autoencoder", .values = study.Errors(i, kAutoencoder)});
+      picture.boxes.push_back({.label = "not projected", .values = study.Errors(i, kNotProjected)});
     }
   }
   METAEKF_ASSIGN_OR_RETURN(std::string svg, plot::RenderSvg(picture));
@@ -248,12 +249,12 @@ absl::StatusOr<Picture> DrawStates(const Study& study) {
   constexpr Index kLongest = 1000;  // samples that can be told apart
   const size_t target = std::min(static_cast<size_t>(base::Rng(kFirstSeed, 0).Uniform(0, 1) * static_cast<double>(study.scale.targets)),
                                  static_cast<size_t>(study.scale.targets - 1));
-  const Trial& trial = study.trials[study.IndexOf(kVaporMaml)][target];
+  const Trial& trial = study.trials[study.IndexOf(kVaporPrior)][target];
   const Index context = study.scale.context, count = std::min<Index>(kLongest, study.scale.samples - context);
   const MatrixXd truth = study.Recording(target).states.middleCols(context, count);
   std::vector<double> times;
   for (Index t = 0; t < count; ++t) times.push_back(static_cast<double>(t + context) * sim::kVaporCompressionSamplePeriodS);
-  plot::Figure figure{.title = absl::StrCat("Target ", target, " (drawn by lot), MAML"), .x_label = "t (s)", .panel_height_px = 170};
+  plot::Figure figure{.title = absl::StrCat("Target ", target, " (drawn by lot), ", kVaporPrior), .x_label = "t (s)", .panel_height_px = 170};
   for (const Shown& shown : kShown) {
     plot::Panel panel{.y_label = shown.label};
     for (const auto& [label, run, colour] : {std::tuple{"adapted", &trial.adapted_run, plot::Colour::kGreen}, {"unadapted", &trial.unadapted_run, plot::Colour::kVermilion}}) {

@@ -19,28 +19,42 @@ constexpr char kCommon[] = R"json({
   },
   "loss": {"horizon": 20, "stride": 20, "rollout": "STATE", "state_weight": 300, "reconstruction_weight": 100},
   "linear_start": true, "context_samples": 200, "target_samples": 400, "contexts_at_start": true, "validation_share": 0.1,
-  "clip_norm": 2, "validation_period": 100, "warmup_horizon": 5, "warmup_lr": 0.001, "outer_lr": 0.0003, "final_outer_lr": 1e-5
+  "clip_norm": 2, "validation_period": 100, "warmup_horizon": 5, "final_outer_lr": 1e-5
+})json";
+
+/// An offset of the latents for every system, along two directions in the end: what one length of pipe or another does. Two latents
+/// more than states and inputs have hold what these do not tell.
+constexpr char kPrior[] = R"json({
+  "algorithm": "GAUSSIAN_PRIOR", "task_batch": 8, "model": {"latent_size": 28}, "outer_lr": 0.001, "horizon_growth_iterations": 36000,
+  "inner_loop": {"steps": 1, "adapted_mask": "encoder.0.bias", "proximal": 0.001},
+  "gaussian_prior": {"meta_iterations": 48000, "meta_algorithm": "MIXED_EFFECTS", "covariance": "MANIFOLD", "rank": 2, "rounds": 1,
+                     "first_steps": 6, "round_steps": 4},
+  "adaptation": {"steps": 20}
 })json";
 
 constexpr char kMaml[] = R"json({
   "algorithm": "MAML", "task_batch": 4, "iterations": 27000, "warmup_iterations": 24000, "horizon_growth_iterations": 1000,
+  "warmup_lr": 0.001, "outer_lr": 0.0003,
   "inner_loop": {"steps": 10, "learning_rate": 0.5, "learned_rates": true, "curvature_rates": true, "adapted_mask": "transition.3.weight"},
   "adaptation": {"steps": 10}
 })json";
 
 constexpr char kUniversal[] = R"json({
-  "algorithm": "SUPERVISED", "task_batch": 8, "iterations": 30000, "warmup_iterations": 24000, "horizon_growth_iterations": 2000,
+  "algorithm": "SUPERVISED", "task_batch": 8, "iterations": 48000, "horizon_growth_iterations": 36000, "outer_lr": 0.001,
   "inner_loop": {"steps": 1}, "adaptation": {"steps": 0}
 })json";
 
 /// Of a quick study.
-constexpr char kShort[] = R"json({"iterations": 6900, "warmup_iterations": 6500, "horizon_growth_iterations": 150})json";
-constexpr char kShortUniversal[] = R"json({"iterations": 8000, "warmup_iterations": 6500, "horizon_growth_iterations": 500})json";
+constexpr char kShortPrior[] = R"json({"horizon_growth_iterations": 5000, "gaussian_prior": {"meta_iterations": 7000}})json";
+constexpr char kShortMaml[] = R"json({"iterations": 6900, "warmup_iterations": 6500, "horizon_growth_iterations": 150})json";
+constexpr char kShortUniversal[] = R"json({"iterations": 7000, "horizon_growth_iterations": 5000})json";
 /// To see that everything runs.
 constexpr char kTiny[] = R"json({
-  "iterations": 8, "warmup_iterations": 4, "horizon_growth_iterations": 2, "task_batch": 2, "target_samples": 60, "context_samples": 60,
+  "iterations": 8, "horizon_growth_iterations": 2, "task_batch": 2, "target_samples": 60, "context_samples": 60,
   "validation_period": 4, "validation_share": 0.2
 })json";
+constexpr char kTinyMaml[] = R"json({"warmup_iterations": 4})json";
+constexpr char kTinyPrior[] = R"json({"gaussian_prior": {"meta_iterations": 8, "first_steps": 2, "round_steps": 2}, "adaptation": {"steps": 2}})json";
 
 json Merged(json a, const json& b) {
   a.merge_patch(b);
@@ -69,17 +83,19 @@ std::vector<double> PressureOrder() {
 
 std::vector<Learner> VaporCompressionLearners(Budget budget) {
   const json order = {{"model", {{"state_constraint", {{"polyhedron", {{"matrix", PressureOrder()}}}}}}}};
-  const auto shortened = [budget](json recipe, const char* quick) {
-    if (budget == Budget::kQuick) return Merged(std::move(recipe), Parsed(quick));
-    return budget == Budget::kTiny ? Merged(std::move(recipe), Parsed(kTiny)) : recipe;
+  const auto recipe = [budget](const char* own, const char* quick, const char* tiny) {
+    json merged = Merged(Parsed(kCommon), Parsed(own));
+    if (budget == Budget::kQuick) return Merged(std::move(merged), Parsed(quick));
+    return budget == Budget::kTiny ? Merged(Merged(std::move(merged), Parsed(kTiny)), Parsed(tiny)) : merged;
   };
-  const json maml = Merged(Parsed(kCommon), shortened(Parsed(kMaml), kShort));
-  const json universal = Merged(Parsed(kCommon), shortened(Parsed(kUniversal), kShortUniversal));
+  const json prior = recipe(kPrior, kShortPrior, kTinyPrior), maml = recipe(kMaml, kShortMaml, kTinyMaml),
+             universal = recipe(kUniversal, kShortUniversal, "{}");
   std::vector<Learner> learners;
-  for (const auto& [label, recipe] : {std::pair{kVaporMaml, maml}, {kVaporUniversal, universal}}) {
-    learners.push_back({label, TrainingData::kFleet, Merged(recipe, order)});
-    learners.push_back({Unconstrained(label), TrainingData::kFleet, recipe});
+  for (const auto& [label, specification] : {std::pair{kVaporPrior, prior}, {kVaporUniversal, universal}}) {
+    learners.push_back({label, TrainingData::kFleet, Merged(specification, order)});
+    learners.push_back({Unconstrained(label), TrainingData::kFleet, specification});
   }
+  learners.push_back({kVaporMaml, TrainingData::kFleet, Merged(maml, order)});
   learners.push_back({kVaporTold, TrainingData::kFleet, Merged(universal, order)});
   learners.back().specification["model"]["latent_size"] = 27;
   return learners;

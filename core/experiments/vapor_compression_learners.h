@@ -9,7 +9,7 @@
 namespace metaekf::experiments {
 
 /// Labels of vapor-compression learners that findings and figures name.
-inline constexpr char kVaporMaml[] = "MAML", kVaporUniversal[] = "one model for all",
+inline constexpr char kVaporPrior[] = "mixed effects and prior", kVaporMaml[] = "MAML", kVaporUniversal[] = "one model for all",
                       kVaporTold[] = "one model for all, told the pipe length";
 /// The same without the order of pressures in the model. @param label  of the constrained one.
 std::string Unconstrained(const std::string& label);

@@ -39,7 +39,10 @@ nssm::FilterNoise Scaled(const nssm::FilterNoise& noise, const VectorXd& log_sca
   const VectorXd d = (0.5 * log_scales).array().exp();
   const VectorXd d_q = layout.process == n ? VectorXd(d.head(n)) : VectorXd::Constant(n, d[0]);
   const VectorXd d_r = d.tail(layout.measurement);
-  return {d_q.asDiagonal() * noise.process * d_q.asDiagonal(), d_r.asDiagonal() * noise.measurement * d_r.asDiagonal(), noise.initial};
+  nssm::FilterNoise scaled = noise;
+  scaled.process = d_q.asDiagonal() * noise.process * d_q.asDiagonal();
+  scaled.measurement = d_r.asDiagonal() * noise.measurement * d_r.asDiagonal();
+  return scaled;
 }
 
 double LogDensity(double error, double variance) { return -0.5 * (error * error / variance + std::log(2 * std::numbers::pi * variance)); }
@@ -145,34 +148,53 @@ double TopOfParabola(const std::function<double(const VectorXd&)>& objective, co
   return better > value ? (up > down ? kLargestMove : -kLargestMove) : 0;
 }
 
-}  // namespace
-
-nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, const CalibrationPrior& prior,
-                            base::Executor* executor) {
-  const std::shared_ptr<const FilterModel> model = FilterModel::Create(bundle);
+/// Where every run's filter begins. Errors: those of Begin.
+absl::StatusOr<std::vector<Prepared>> PrepareAll(const nssm::Bundle& bundle, const std::shared_ptr<const FilterModel>& model,
+                                                 const std::vector<CalibrationRun>& runs) {
   std::vector<Prepared> prepared;
   for (const CalibrationRun& run : runs) {
     prepared.push_back({&run.trajectory, model->Prepare(run.parameters), {}});
-    if (!Begin(bundle, model, &prepared.back()).ok()) return bundle.noise;
+    METAEKF_RETURN_IF_ERROR(Begin(bundle, model, &prepared.back()));
   }
+  return prepared;
+}
+
+/// Mean over runs.
+Score ScoreOfAll(const nssm::Bundle& bundle, const nssm::FilterNoise& noise, const std::shared_ptr<const FilterModel>& model,
+                 const std::vector<Prepared>& runs, base::Executor* executor) {
+  std::vector<Score> scores(runs.size());
+  executor->ParallelFor(runs.size(), [&](size_t i, size_t) { scores[i] = ScoreOf(bundle, noise, model, runs[i]); });
+  Score total = scores[0];
+  for (size_t i = 1; i < scores.size(); ++i) {
+    total.likelihood += scores[i].likelihood;
+    if (total.likelihood > kFailed) total.squares += scores[i].squares;
+  }
+  const double count = static_cast<double>(scores.size());
+  total.squares /= count;
+  total.likelihood /= count;
+  return total;
+}
+
+}  // namespace
+
+double LogLikelihood(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, base::Executor* executor) {
+  const std::shared_ptr<const FilterModel> model = FilterModel::Create(bundle);
+  const absl::StatusOr<std::vector<Prepared>> prepared = PrepareAll(bundle, model, runs);
+  return prepared.ok() ? ScoreOfAll(bundle, bundle.noise, model, *prepared, executor).likelihood : kFailed;
+}
+
+nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, double log_std, base::Executor* executor) {
+  if (log_std == 0) return bundle.noise;
+  const std::shared_ptr<const FilterModel> model = FilterModel::Create(bundle);
+  const absl::StatusOr<std::vector<Prepared>> prepared = PrepareAll(bundle, model, runs);
+  if (!prepared.ok()) return bundle.noise;
   const Layout layout{.process = bundle.model.spec().is_case_one() ? 1 : bundle.noise.process.rows(),
                       .measurement = bundle.noise.measurement.rows()};
   const auto score = [&](const VectorXd& log_scales) {
-    Score total;
-    if (log_scales.lpNorm<Eigen::Infinity>() > kLargest) return total;
-    const nssm::FilterNoise noise = Scaled(bundle.noise, log_scales, layout);
-    std::vector<Score> scores(prepared.size());
-    executor->ParallelFor(prepared.size(), [&](size_t i, size_t) { scores[i] = ScoreOf(bundle, noise, model, prepared[i]); });
-    total = scores[0];
-    for (size_t i = 1; i < scores.size(); ++i) {
-      total.likelihood += scores[i].likelihood;
-      if (total.likelihood > kFailed) total.squares += scores[i].squares;
-    }
-    const double count = static_cast<double>(scores.size());
-    total.squares /= count;
-    total.likelihood = total.likelihood / count - 0.5 * (log_scales.head(layout.process) / prior.process_std).squaredNorm() -
-                       0.5 * (log_scales.tail(layout.measurement) / prior.measurement_std).squaredNorm();
-    return total;
+    if (log_scales.lpNorm<Eigen::Infinity>() > kLargest) return Score();
+    Score found = ScoreOfAll(bundle, Scaled(bundle.noise, log_scales, layout), model, *prepared, executor);
+    found.likelihood -= 0.5 * (log_scales / log_std).squaredNorm();
+    return found;
   };
   const auto objective = [&](const VectorXd& log_scales) { return score(log_scales).likelihood; };
 

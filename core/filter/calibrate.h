@@ -1,6 +1,5 @@
 #pragma once
 
-#include <limits>
 #include <vector>
 
 #include "core/base/executor.h"
@@ -13,12 +12,6 @@ namespace metaekf::filter {
 struct CalibrationRun {
   std::vector<double> parameters;
   data::Trajectory trajectory;  ///< physical units; Case II with states
-};
-
-/// How far Q and R may be from what they were; infinite: as far as the recordings say.
-struct CalibrationPrior {
-  double process_std = std::numeric_limits<double>::infinity();
-  double measurement_std = std::numeric_limits<double>::infinity();
 };
 
 /// Q and R with which filters explain recordings best.
@@ -35,10 +28,14 @@ struct CalibrationPrior {
 /// entry, six times at most.
 ///
 /// @param bundle  with Q₀, R₀ and P₀ in its noise. @param runs  at least one, of systems that the parameters were not fitted to, or of
-///   samples that come after those. @param prior  s of ln d², beside the mean over samples.
-/// @return the noise with Q and R scaled; as it was where no filter stays finite.
+///   samples that come after those. @param log_std  s of ln d², beside the mean over
+///   samples; infinite: as far as the recordings say.
+/// @return the noise with Q and R scaled; as it was where no filter stays finite, and for s = 0.
 /// Source: maximum likelihood of innovations, e.g. R. K. Mehra, IEEE Trans. Autom. Control 15 (1970) 175; the scaling is ours.
-nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, const CalibrationPrior& prior,
-                            base::Executor* executor);
+nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, double log_std, base::Executor* executor);
+
+/// How well filters with the bundle's noise explain recordings: what Calibrate makes largest, without its prior.
+/// @return per sample, mean over runs; −∞ where a filter does not stay finite.
+double LogLikelihood(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, base::Executor* executor);
 
 }  // namespace metaekf::filter

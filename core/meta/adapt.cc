@@ -31,7 +31,6 @@ using OnStep = std::function<bool(const AdaptationStep&)>;
 // How far Q and R of a system may be from the fleet's. Of 60 oscillators whose filters ran on, 1 for Q explains the states best: 0.3 is no
 // better than the fleet's noise, 3 makes the few samples of a tail count for too much. For R, 2 is a compromise: with noise ten times
 // the fleet's bounds of 95 % hold the truth for 69, 81, 84, 86 % of samples at 1, 2, 3, 5, with the fleet's own for 94.0, 93.7, 93.7, 93.6 %.
-constexpr filter::CalibrationPrior kNoisePrior = {.process_std = 1, .measurement_std = 2};
 constexpr int64_t kMaxColumns = 1 << 17;
 
 constexpr int32_t kTailChecks = 50;    // of a trial that may stop early
@@ -367,7 +366,7 @@ nssm::FilterNoise NoiseOnTail(const Bundle& bundle, std::vector<double> paramete
   // A filter's first window may reach into what has been seen: it is not what is judged.
   const int64_t begin = bundle.model.spec().is_case_one() ? std::max<int64_t>(0, held_out_from - bundle.model.spec().warmup()) : held_out_from;
   const absl::StatusOr<Trajectory> run = data::SamplesFrom(context, begin);
-  return filter::Calibrate(bundle, {{std::move(parameters), *run}}, kNoisePrior, executor);
+  return filter::Calibrate(bundle, {{std::move(parameters), *run}}, bundle.noise.log_std, executor);
 }
 
 /// Samples of the context's end that are held out.
@@ -419,6 +418,22 @@ absl::StatusOr<std::vector<double>> AdaptedParameters(const Bundle& bundle, cons
   METAEKF_ASSIGN_OR_RETURN(FitResult fit,
                            FitAnyPrecision(bundle, problem, problem.context, options, nullptr));
   return std::move(fit.parameters);
+}
+
+absl::StatusOr<std::vector<nssm::FilterNoise>> NoiseOfContext(const Bundle& bundle, const Trajectory& context,
+                                                              const AdaptationOptions& options, const std::vector<double>& log_stds) {
+  METAEKF_ASSIGN_OR_RETURN(Problem problem, Pose(bundle, context, options));
+  const Eigen::Index held_out_from = context.length() - TailSamples(bundle.model.spec(), context.length());
+  METAEKF_ASSIGN_OR_RETURN(const Trajectory head, data::FirstSamples(problem.context, held_out_from));
+  problem.tolerance = kTrialTolerance;
+  METAEKF_ASSIGN_OR_RETURN(const FitResult fit, FitAnyPrecision(bundle, problem, head, options, nullptr));
+  std::vector<nssm::FilterNoise> noises;
+  Bundle prior = bundle;
+  for (const double log_std : log_stds) {
+    prior.noise.log_std = log_std;
+    noises.push_back(NoiseOnTail(prior, fit.parameters, context, held_out_from, options.executor));
+  }
+  return noises;
 }
 
 absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& context,

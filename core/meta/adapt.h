@@ -68,6 +68,10 @@ bool BetterInFreeRun(const TailErrors& a, const TailErrors& b);
 absl::StatusOr<std::vector<double>> AdaptedParameters(const nssm::Bundle& bundle, const data::Trajectory& context,
                                                       const AdaptationOptions& options);
 
+/// Q and R as Adapt finds them on the tail, for each of several priors: FilterNoise::log_std. Arguments and errors as those of Adapt.
+absl::StatusOr<std::vector<nssm::FilterNoise>> NoiseOfContext(const nssm::Bundle& bundle, const data::Trajectory& context,
+                                                              const AdaptationOptions& options, const std::vector<double>& log_stds);
+
 /// Where an adaptation stands.
 struct AdaptationStep {
   bool trial = false;  ///< of the trial on the head of the context, whose only use is the errors on its tail

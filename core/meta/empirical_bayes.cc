@@ -29,6 +29,7 @@ constexpr double kStalled = 6;            // times the median mean square of the
 constexpr size_t kBatch = 8;              // systems between two calls of on_step
 constexpr Index kGuessStride = 5;         // samples between windows of the regression for the start
 constexpr double kGuessRidge = 1e-8;
+constexpr double kOwnDoubt = 1e-3;        // of the mean variance of systems' own parameters
 
 double Median(std::vector<double> values) {
   std::nth_element(values.begin(), values.begin() + static_cast<Index>(values.size() / 2), values.end());
@@ -74,10 +75,14 @@ struct Population {
   std::vector<bool> accepted;
 };
 
+bool FitsBeginTogether(const GaussianPriorSpec& options) {
+  return options.meta_iterations > 0 && options.meta_algorithm == Algorithm::kMixedEffects;
+}
+
 class Learner {
  public:
   Learner(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask, const Systems& systems,
-          const std::vector<double>& shared, base::Executor* executor, TrainingState* state, const OnTrainingStep& on_step)
+          const LearnedStart& shared, base::Executor* executor, TrainingState* state, const OnTrainingStep& on_step)
       : spec_(spec),
         options_(spec.gaussian_prior),
         model_(model),
@@ -94,7 +99,7 @@ class Learner {
     METAEKF_ASSIGN_OR_RETURN(data_, CutAll(plan_.dynamics));
     if (state_.values.empty()) {
       state_.iteration = options_.meta_iterations;
-      METAEKF_RETURN_IF_ERROR(shared_.empty() ? FirstFit() : BeginFromShared());
+      METAEKF_RETURN_IF_ERROR(shared_.parameters.empty() ? FirstFit() : BeginFromShared());
     } else {
       METAEKF_RETURN_IF_ERROR(Restore());
     }
@@ -141,18 +146,31 @@ class Learner {
 
   /// ω₀ is there, and the noise is what a fit of one system from there leaves.
   absl::Status BeginFromShared() {
-    start_ = shared_;
-    Believe(GatherAdapted(plan_.dynamics, shared_), VectorXd::Ones(plan_.dynamics.channels()));
-    const MapFit fit = FitMap(plan_.dynamics, data_[0], shared_, population_.belief, population_.belief.mean,
+    start_ = shared_.parameters;
+    Believe(GatherAdapted(plan_.dynamics, start_), VectorXd::Ones(plan_.dynamics.channels()));
+    const MapFit fit = FitMap(plan_.dynamics, data_[0], start_, population_.belief, population_.belief.mean,
                               {.optimiser = {.max_iterations = options_.first_steps, .tolerance = kTolerance}, .noise_samples = 1},
                               workspaces_[0].For(plan_.dynamics, data_[0].shape));
     if (!fit.unknowns.allFinite() || !fit.noise_variance.allFinite()) {
       return absl::OutOfRangeError("the training diverged: no fit of the first system from what MAML has learned");
     }
     population_.belief.noise_variance = fit.noise_variance;
+    if (shared_.own.size() > 0) METAEKF_RETURN_IF_ERROR(BelieveOwn());
     ++state_.iteration;
     Save(0);  // whoever is told may keep this state, by which the training knows that MAML is done
     return Tell(0);
+  }
+
+  /// The systems' own parameters are their first fits, as if they had been found without doubt but for kOwnDoubt.
+  absl::Status BelieveOwn() {
+    const Index p = plan_.dynamics.adapted_size(), size = population_.belief.mean.size();
+    const size_t count = data_.size();
+    for (size_t s = 0; s < count; ++s) population_.fits[s].head(p) = shared_.own.col(static_cast<Index>(s));
+    const double spread = (shared_.own.colwise() - shared_.own.rowwise().mean()).squaredNorm() / static_cast<double>(shared_.own.size());
+    MatrixXd doubt = MatrixXd::Identity(size, size);
+    doubt.topLeftCorner(p, p) *= kOwnDoubt * spread;
+    const std::vector<double> ones(count, 1.0);
+    return Maximise(ones, std::vector<VectorXd>(count, population_.belief.noise_variance), std::vector<MatrixXd>(count, doubt), &population_);
   }
 
   /// Before the first round: N(θ, initial_std²), and every fit begins at θ.
@@ -187,10 +205,13 @@ class Learner {
       if (round_ == 0) current.prior.examples = Examples(first);
       executor_.ParallelFor(batch, [&](size_t i, size_t slot) {
         const size_t s = first + i;
-        // With other fits among its starts a system can join the basin that most are in, where the prior is narrower.
-        absl::StatusOr<SystemFit> found =
-            FitSystem(plan_, current.prior, current.parameters, systems_.training[s],
-                      {.steps = steps, .tolerance = kTolerance, .noise_samples = std::numeric_limits<double>::infinity()}, nullptr);
+        // With other fits among its starts a system can join the basin that most are in, where the prior is narrower. Mixed effects
+        // have been found together: they are in one.
+        absl::StatusOr<SystemFit> found = absl::NotFoundError("");
+        if (!FitsBeginTogether(options_)) {
+          found = FitSystem(plan_, current.prior, current.parameters, systems_.training[s],
+                            {.steps = steps, .tolerance = kTolerance, .noise_samples = std::numeric_limits<double>::infinity()}, nullptr);
+        }
         MapFit own = FitMap(plan_.dynamics, data_[s], current.parameters, belief, population_.fits[s],
                             {.optimiser = {.max_iterations = steps, .tolerance = kTolerance, .initial_damping = kWarmDamping}},
                             workspaces_[slot].For(plan_.dynamics, data_[s].shape));
@@ -435,7 +456,7 @@ class Learner {
   const nssm::Model& model_;
   const FitPlan plan_;
   const Systems& systems_;
-  const std::vector<double>& shared_;
+  const LearnedStart& shared_;
   base::Executor& executor_;
   TrainingState& state_;
   const OnTrainingStep& on_step_;
@@ -450,7 +471,7 @@ class Learner {
 }  // namespace
 
 absl::StatusOr<LearnedPrior> LearnGaussianPrior(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
-                                                const Systems& systems, const std::vector<double>& shared, base::Executor* executor,
+                                                const Systems& systems, const LearnedStart& shared, base::Executor* executor,
                                                 TrainingState* state, const OnTrainingStep& on_step) {
   return Learner(spec, model, mask, systems, shared, executor, state, on_step).Run();
 }

@@ -25,11 +25,12 @@ struct LearnedPrior {
 /// recognised by residuals far above the others', do not count in the M-step and begin the next round from the fits of
 /// others. Held-out systems judge every round: the best prior is returned.
 ///
-/// @param shared  ω to begin with, of which what does not adapt stays as it is; empty: there is none.
+/// @param shared  ω to begin with, of which what does not adapt stays as it is; empty: there is none. Where it has systems' own
+///   parameters, they are the first fits, and the first belief is N(mean, spread) of these.
 /// Errors: InvalidArgument if that structure has a larger rank than there are parameters; Cancelled if on_step said so;
 /// OutOfRange if no start of the first fit simulates its system.
 absl::StatusOr<LearnedPrior> LearnGaussianPrior(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
-                                                const Systems& systems, const std::vector<double>& shared, base::Executor* executor,
+                                                const Systems& systems, const LearnedStart& shared, base::Executor* executor,
                                                 TrainingState* state, const OnTrainingStep& on_step);
 
 /// What its progress counts up to: outer steps of MAML before it, starts, and fits of `systems` training systems.

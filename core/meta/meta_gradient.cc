@@ -30,7 +30,8 @@ InnerRecord RecordFor(const TrainingSpec& spec) {
 
 template <typename T>
 InnerLoop<T> MakeLoop(const nssm::Model& model, const TrainingSpec& spec, const nn::Mask& adapted) {
-  const int32_t steps = spec.algorithm == Algorithm::kSupervised ? 0 : spec.inner_loop.steps;
+  const bool one_loop = spec.algorithm == Algorithm::kSupervised || spec.algorithm == Algorithm::kMixedEffects;
+  const int32_t steps = one_loop ? 0 : spec.inner_loop.steps;
   const double pull = spec.algorithm == Algorithm::kImplicitMaml ? spec.inner_loop.proximal : 0;
   return InnerLoop<T>(model.layout(), adapted, spec.inner_loop.optimiser, steps, pull, RecordFor(spec));
 }

@@ -65,6 +65,25 @@ TrainingSpec SpecOf(const TrainingSpec& spec, int32_t iteration) {
   return own;
 }
 
+/// Of MIXED_EFFECTS: where each training system's own δ are among the variables, and which of ω they are added to.
+class OwnEffects {
+ public:
+  /// @param first  variables before the δ.
+  OwnEffects(const nssm::Model& model, const nn::Mask& mask, size_t first) : first_(first) {
+    for (size_t i = 0; i < mask.size(); ++i) {
+      const nn::Tensor& tensor = model.layout().tensors()[i];
+      for (int64_t k = 0; mask[i] && k < tensor.size(); ++k) entries_.push_back(static_cast<size_t>(tensor.offset + k));
+    }
+  }
+  size_t size() const { return entries_.size(); }
+  size_t entry(size_t k) const { return entries_[k]; }
+  size_t variable(size_t system, size_t k) const { return first_ + system * entries_.size() + k; }
+
+ private:
+  size_t first_;
+  std::vector<size_t> entries_;
+};
+
 /// One phase of training: what a loss and an algorithm need to be drawn and evaluated.
 template <typename T>
 class Phase {
@@ -76,7 +95,9 @@ class Phase {
         executor_(executor),
         context_shape_(*nssm::ShapeOfLoss(spec.model, spec.loss, spec.context_samples)),
         target_shape_(*nssm::ShapeOfLoss(spec.model, spec.loss, spec.target_samples)),
-        meta_gradient_(model, spec, context_shape_, target_shape_, mask) {
+        meta_gradient_(model, spec, context_shape_, target_shape_, mask),
+        own_(model, mask, meta_gradient_.variables()),
+        of_systems_(executor->concurrency()) {
     for (size_t slot = 0; slot < executor->concurrency(); ++slot) scratch_.emplace_back(meta_gradient_);
     gradients_.assign(static_cast<size_t>(spec.task_batch), std::vector<T>(meta_gradient_.variables()));
   }
@@ -85,19 +106,26 @@ class Phase {
   double Gradient(int32_t iteration, const std::vector<double>& at, std::vector<double>* mean) {
     const std::vector<T> parameters(at.begin(), at.end());
     const size_t tasks = gradients_.size();
+    const bool mixed = spec_.algorithm == Algorithm::kMixedEffects;
     std::vector<double> losses(tasks);
+    std::vector<size_t> drawn(tasks);
     executor_->ParallelFor(tasks, [&](size_t task, size_t slot) {
       base::Rng rng(spec_.seed, 1 + static_cast<uint64_t>(iteration) * tasks + task);
-      const Trajectory& system = systems_.training[rng.Index(systems_.training.size())];
+      drawn[task] = rng.Index(systems_.training.size());
+      const Trajectory& system = systems_.training[drawn[task]];
       const LossData<T> context = DrawContext(system, &rng), target = DrawTarget(system, &rng);
-      losses[task] = meta_gradient_.Compute(parameters.data(), context, target, gradients_[task].data(), &scratch_[slot]);
+      const T* variables = mixed ? OfSystem(drawn[task], parameters, &of_systems_[slot]) : parameters.data();
+      losses[task] = meta_gradient_.Compute(variables, context, target, gradients_[task].data(), &scratch_[slot]);
     });
     mean->assign(parameters.size(), 0.0);
+    const double share = 1 / static_cast<double>(tasks);
     double loss = 0;
     for (size_t task = 0; task < tasks; ++task) {
-      loss += losses[task] / static_cast<double>(tasks);
-      for (size_t i = 0; i < parameters.size(); ++i) {
-        (*mean)[i] += static_cast<double>(gradients_[task][i]) / static_cast<double>(tasks);
+      loss += share * losses[task];
+      for (size_t i = 0; i < gradients_[task].size(); ++i) (*mean)[i] += share * static_cast<double>(gradients_[task][i]);
+      for (size_t k = 0; mixed && k < own_.size(); ++k) {
+        const size_t own = own_.variable(drawn[task], k);
+        (*mean)[own] += share * (static_cast<double>(gradients_[task][own_.entry(k)]) + spec_.inner_loop.proximal * at[own]);
       }
     }
     return loss;
@@ -147,6 +175,12 @@ class Phase {
   }
 
  private:
+  /// ω + δ of a system.
+  const T* OfSystem(size_t system, const std::vector<T>& variables, std::vector<T>* own) const {
+    own->assign(variables.begin(), variables.begin() + static_cast<std::ptrdiff_t>(meta_gradient_.variables()));
+    for (size_t k = 0; k < own_.size(); ++k) (*own)[own_.entry(k)] += variables[own_.variable(system, k)];
+    return own->data();
+  }
   LossData<T> Draw(const Trajectory& system, int32_t samples, const LossShape& shape, base::Rng* rng) const {
     const uint64_t places = static_cast<uint64_t>(system.length() - samples + 1);
     return nssm::CutLossData<T>(spec_.model, spec_.loss, system, static_cast<int64_t>(rng->Index(places)), shape);
@@ -164,6 +198,8 @@ class Phase {
   base::Executor* executor_;
   const LossShape context_shape_, target_shape_;
   const MetaGradient<T> meta_gradient_;
+  const OwnEffects own_;
+  std::vector<std::vector<T>> of_systems_;  // ω + δ, one per thread
   std::vector<typename MetaGradient<T>::Scratch> scratch_;
   std::vector<std::vector<T>> gradients_;
 };
@@ -206,6 +242,9 @@ std::map<std::string, std::vector<double>> FreshValues(const TrainingSpec& spec,
       if (mask[i]) variables.push_back(std::log(rates[i]));
     }
   }
+  if (spec.algorithm == Algorithm::kMixedEffects) {
+    variables.resize(variables.size() + systems.training.size() * OwnEffects(model, mask, 0).size(), 0.0);
+  }
   nssm::RoundToPrecision(spec.model.precision, &variables);
   const std::vector<double> zeros(variables.size());
   return {{kParameters, variables}, {kFirstMoment, zeros}, {kSecondMoment, zeros}, {kBest, variables}, {kFirstLoss, {0}}};
@@ -224,10 +263,22 @@ absl::Status Diverged(const TrainingSpec& spec, int32_t iteration, double loss, 
 }
 
 /// The best or last variables, taken apart.
-LearnedStart TakeApart(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
+LearnedStart TakeApart(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask, size_t systems,
                        const std::vector<double>& variables) {
   const auto rates = variables.begin() + model.layout().size();
   LearnedStart result{.parameters = std::vector<double>(variables.begin(), rates)};
+  if (spec.algorithm == Algorithm::kMixedEffects) {
+    const OwnEffects own(model, mask, result.parameters.size());
+    result.own.resize(static_cast<Eigen::Index>(own.size()), static_cast<Eigen::Index>(systems));
+    for (size_t k = 0; k < own.size(); ++k) {
+      const auto row = static_cast<Eigen::Index>(k);
+      for (size_t s = 0; s < systems; ++s) {
+        result.own(row, static_cast<Eigen::Index>(s)) = result.parameters[own.entry(k)] + variables[own.variable(s, k)];
+      }
+      result.parameters[own.entry(k)] = result.own.row(row).mean();
+    }
+    nssm::RoundToPrecision(spec.model.precision, &result.parameters);
+  }
   if (!spec.inner_loop.learned_rates) return result;
   auto rate = rates;
   for (size_t i = 0; i < mask.size(); ++i) {
@@ -267,7 +318,7 @@ class OuterLoop {
         return stepped;
       }
       // Rates that stand for multiples still adapt nothing.
-      const bool judgeable = !spec_.inner_loop.curvature_rates || iteration >= spec_.warmup_iterations;
+      const bool judgeable = spec_.algorithm != Algorithm::kMixedEffects && (!spec_.inner_loop.curvature_rates || iteration >= spec_.warmup_iterations);
       const bool validate = stepped.ok() && judgeable && !systems_.validation.empty() &&
                             ((iteration + 1) % spec_.validation_period == 0 || iteration + 1 == spec_.iterations ||
                              schedule_.ends_start(state_->iteration));
@@ -432,7 +483,8 @@ absl::StatusOr<LearnedStart> RunOuterLoop(const TrainingSpec& spec, const nssm::
   METAEKF_RETURN_IF_ERROR(spec.model.precision == nssm::Precision::kFloat32
                               ? OuterLoop<float>(spec, model, mask, systems, executor, state).Run(on_step)
                               : OuterLoop<double>(spec, model, mask, systems, executor, state).Run(on_step));
-  return TakeApart(spec, model, mask, state->values[systems.validation.empty() ? kParameters : kBest]);
+  const bool judged = !systems.validation.empty() && spec.algorithm != Algorithm::kMixedEffects;
+  return TakeApart(spec, model, mask, systems.training.size(), state->values[judged ? kBest : kParameters]);
 }
 
 }  // namespace metaekf::meta

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <Eigen/Core>
 #include <map>
 #include <string>
 #include <vector>
@@ -21,6 +22,7 @@ struct Systems {
 struct LearnedStart {
   std::vector<double> parameters;              ///< ω
   std::map<std::string, double> tensor_rates;  ///< β by tensor, if they are learned
+  Eigen::MatrixXd own;                         ///< of MIXED_EFFECTS: adapted parameters × training systems
 };
 
 /// The outer loop of the gradient-based algorithms (paper.tex algorithm alg:maml).
@@ -31,6 +33,13 @@ struct LearnedStart {
 ///
 /// The state's "parameters" and "best_parameters" are the variables of MetaGradient: ω, then log β of every adapted tensor
 /// if rates are learned. Both move by the same Adam step and count in the norm that is clipped.
+///
+/// MIXED_EFFECTS adds to these a δ_s of what adapts for every training system s, zero in the warm-up, and minimises
+///
+///   mean over s of  L(𝓣_s; ω + δ_s) + ½ λ |δ_s|²,     λ = inner_loop.proximal.
+///
+/// Dense Adam on δ, whose gradient is zero where a system is not drawn: rarely drawn effects take steps as large as the others'.
+/// A held-out system has no δ, so nothing is judged and the last ω is the result, with the mean of δ_s in it.
 ///
 /// A training diverges when a loss or gradient is no number, or the running mean of the loss is a million times what the
 /// phase began with (and 1). The state then goes back to before the step that led there, and on_step hears of it once more.

@@ -2,6 +2,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
+#include <limits>
 
 #include "core/base/numbers.h"
 #include "core/base/status.h"
@@ -72,13 +74,13 @@ std::vector<data::ScaleGroup> ScaleGroups(const ModelSpec& model) {
   return {field, position};
 }
 
-/// Before a prior is learned: ω from MAML, if it is asked for and the prior has not begun yet. Leaves the state as the prior begins.
-absl::StatusOr<std::vector<double>> SharedParameters(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
+/// Before a prior is learned: what a meta-learner finds, if one is asked for and the prior has not begun yet. Leaves the state as the prior begins.
+absl::StatusOr<LearnedStart> SharedParameters(const TrainingSpec& spec, const nssm::Model& model, const nn::Mask& mask,
                                                      const Systems& systems, base::Executor* executor, TrainingState* state,
                                                      const OnTrainingStep& on_step) {
-  if (spec.gaussian_prior.meta_iterations == 0 || state->values.contains(kPriorHasBegun)) return std::vector<double>();
+  if (spec.gaussian_prior.meta_iterations == 0 || state->values.contains(kPriorHasBegun)) return LearnedStart();
   TrainingSpec meta = spec;
-  meta.algorithm = Algorithm::kMaml;
+  meta.algorithm = spec.gaussian_prior.meta_algorithm;
   meta.iterations = spec.gaussian_prior.meta_iterations;
   const int32_t iterations = PriorIterations(spec.gaussian_prior, systems.training.size());
   const auto tell = [&](const TrainingProgress& progress) {
@@ -86,16 +88,42 @@ absl::StatusOr<std::vector<double>> SharedParameters(const TrainingSpec& spec, c
   };
   METAEKF_ASSIGN_OR_RETURN(LearnedStart learned, RunOuterLoop(meta, model, mask, systems, executor, state, tell));
   *state = TrainingState();
-  return std::move(learned.parameters);
+  return learned;
 }
 
 /// What a filter of a system is calibrated on: at most so many samples behind its context, fewer the more there is to be found, or all
 /// of a recording that is hardly longer than that.
 constexpr int64_t kCalibrationSamples = 2000, kFewSamples = 50;
+constexpr double kLogStds[] = {0, 0.25, 0.5, 1, 2};
 constexpr double kCalibrationWork = 16000;  // samples of one channel; a search over n channels takes some n^1.5 times as long
 
+/// How far systems' own Q and R are from the fleet's (FilterNoise::log_std): with which of kLogStds what the tails of contexts say
+/// helps most to explain what comes after.
+/// @param runs  that, a run for each context.
+double OwnNoise(const Bundle& bundle, const AdaptationOptions& options, const std::vector<Trajectory>& contexts,
+                const std::vector<filter::CalibrationRun>& runs, base::Executor* executor) {
+  const std::vector<double> candidates(std::begin(kLogStds), std::end(kLogStds));
+  std::vector<std::vector<double>> scores(contexts.size());
+  executor->ParallelFor(contexts.size(), [&](size_t i, size_t) {
+    const absl::StatusOr<std::vector<nssm::FilterNoise>> noises = NoiseOfContext(bundle, contexts[i], options, candidates);
+    if (!noises.ok()) return;  // says nothing, as above
+    Bundle own = bundle;
+    for (const nssm::FilterNoise& noise : *noises) {
+      own.noise = noise;
+      scores[i].push_back(filter::LogLikelihood(own, {runs[i]}, base::CallingThread()));
+    }
+  });
+  double best = candidates.front(), most = -std::numeric_limits<double>::infinity();
+  for (size_t c = 0; c < candidates.size(); ++c) {
+    double sum = 0;
+    for (const std::vector<double>& own : scores) sum += own.empty() ? 0 : own[c];
+    if (sum > most) most = sum, best = candidates[c];
+  }
+  return best;
+}
+
 /// Default Q, R and P₀ from the residuals of the model adapted to each of `systems`, Q and R scaled to what filters of these systems
-/// meet after the context (filter::Calibrate).
+/// meet after the context (filter::Calibrate), and how far from them a system's own may be.
 absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const TrainingSpec& spec,
                                                        const std::vector<Trajectory>& systems, base::Executor* executor) {
   METAEKF_ASSIGN_OR_RETURN(const AdaptationOptions options, DefaultAdaptation(bundle));
@@ -110,7 +138,8 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const Trai
   const double channels = spec.model.state_size + spec.model.output_size;
   const int64_t most = std::clamp(static_cast<int64_t>(kCalibrationWork / std::pow(channels, 1.5)), kFewSamples, kCalibrationSamples);
   filter::NoiseEstimate noise(bundle);
-  std::vector<filter::CalibrationRun> runs;
+  std::vector<filter::CalibrationRun> runs, later_runs;
+  std::vector<Trajectory> contexts;  // of the later runs
   for (size_t i = 0; i < systems.size(); ++i) {
     METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, systems[i]));
     noise.Add(parameters[i], normalised);
@@ -118,9 +147,15 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const Trai
     METAEKF_ASSIGN_OR_RETURN(const Trajectory later, data::SamplesFrom(systems[i], begin));
     METAEKF_ASSIGN_OR_RETURN(Trajectory run, data::FirstSamples(later, std::min<int64_t>(later.length(), most)));
     runs.push_back({parameters[i], std::move(run)});
+    if (begin == 0) continue;
+    METAEKF_ASSIGN_OR_RETURN(Trajectory context, data::FirstSamples(systems[i], wanted));
+    contexts.push_back(std::move(context));
+    later_runs.push_back(runs.back());
   }
   bundle.noise = noise.Result(bundle.normaliser);
-  return filter::Calibrate(bundle, runs, {}, executor);
+  bundle.noise = filter::Calibrate(bundle, runs, std::numeric_limits<double>::infinity(), executor);
+  if (!contexts.empty()) bundle.noise.log_std = OwnNoise(bundle, options, contexts, later_runs, executor);
+  return bundle.noise;
 }
 
 /// The rates that were learned become part of what the model file says of its training and of adaptation.
@@ -178,7 +213,7 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
   const Systems systems{Pick(normalised, split.training), Pick(normalised, split.validation)};
   Bundle bundle{.model = model};
   if (spec.algorithm == Algorithm::kGaussianPrior) {
-    METAEKF_ASSIGN_OR_RETURN(const std::vector<double> shared, SharedParameters(spec, model, mask, systems, executor, &state, on_step));
+    METAEKF_ASSIGN_OR_RETURN(const LearnedStart shared, SharedParameters(spec, model, mask, systems, executor, &state, on_step));
     METAEKF_ASSIGN_OR_RETURN(LearnedPrior learned, LearnGaussianPrior(spec, model, adaptation_mask, systems, shared, executor, &state, on_step));
     bundle.parameters = std::move(learned.parameters);
     bundle.prior = std::move(learned.prior);
@@ -192,7 +227,7 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
   bundle.names = {used.input_names, used.output_names, used.state_names};
   bundle.training = ToJson(spec);
   bundle.provenance = {{"systems", fleet.trajectories.size()}, {"iterations", state.iteration}};
-  if (!systems.validation.empty()) bundle.provenance["validation_loss"] = state.best_validation_loss;
+  if (std::isfinite(state.best_validation_loss)) bundle.provenance["validation_loss"] = state.best_validation_loss;
   std::vector<size_t> judges = systems.validation.empty() ? split.training : split.validation;
   if (judges.size() > kNoiseSystems) judges.resize(kNoiseSystems);
   METAEKF_ASSIGN_OR_RETURN(bundle.noise, NoiseOfAdaptedModels(bundle, spec, Pick(used.trajectories, judges), executor));

@@ -12,7 +12,7 @@ using nlohmann::json;
 const std::vector<std::pair<std::string, Algorithm>> kAlgorithms = {
     {"MAML", Algorithm::kMaml}, {"FIRST_ORDER_MAML", Algorithm::kFirstOrderMaml}, {"SUPERVISED", Algorithm::kSupervised},
     {"GAUSSIAN_PRIOR", Algorithm::kGaussianPrior}, {"REPTILE", Algorithm::kReptile},
-    {"IMPLICIT_MAML", Algorithm::kImplicitMaml}};
+    {"IMPLICIT_MAML", Algorithm::kImplicitMaml}, {"MIXED_EFFECTS", Algorithm::kMixedEffects}};
 
 const std::vector<std::pair<std::string, Optimiser>> kOptimisers = {{"GRADIENT_DESCENT", Optimiser::kGradientDescent},
                                                                     {"ADAM", Optimiser::kAdam},
@@ -74,6 +74,10 @@ GaussianPriorSpec ReadGaussianPrior(JsonFields* parent) {
     return value == 0 ? default_value : value;
   };
   spec.meta_iterations = static_cast<int32_t>(fields.Integer("meta_iterations", 0, 0, kMany));
+  spec.meta_algorithm = fields.Choice("meta_algorithm", spec.meta_algorithm, kAlgorithms);
+  if (spec.meta_algorithm != Algorithm::kMaml && spec.meta_algorithm != Algorithm::kMixedEffects) {
+    fields.Fail("meta_algorithm", absl::StrCat("is MAML or MIXED_EFFECTS, not ", NameOf(kAlgorithms, spec.meta_algorithm)));
+  }
   spec.initial_std = fields.Number("initial_std", spec.initial_std, 1e-9, 1e9);
   spec.rounds = positive("rounds", spec.rounds);
   spec.restarts = positive("restarts", spec.restarts);
@@ -115,7 +119,8 @@ void CheckInnerLoop(const TrainingSpec& spec, JsonFields* fields) {
     }
   }
   const bool by_maml = spec.algorithm == Algorithm::kMaml || spec.algorithm == Algorithm::kFirstOrderMaml ||
-                       (spec.algorithm == Algorithm::kGaussianPrior && spec.gaussian_prior.meta_iterations > 0);
+                       (spec.algorithm == Algorithm::kGaussianPrior && spec.gaussian_prior.meta_iterations > 0 &&
+                        spec.gaussian_prior.meta_algorithm == Algorithm::kMaml);
   if (inner.learned_rates && !by_maml) {
     fields->Fail("inner_loop.learned_rates", "only MAML and FIRST_ORDER_MAML have a gradient for the rates");
   }
@@ -133,20 +138,26 @@ void CheckInnerLoop(const TrainingSpec& spec, JsonFields* fields) {
   }
 }
 
+/// Steps of the outer loop, if there are any.
+int32_t OuterIterations(const TrainingSpec& spec) {
+  return spec.algorithm == Algorithm::kGaussianPrior ? spec.gaussian_prior.meta_iterations : spec.iterations;
+}
+
 /// Whether there is room for rollouts to grow in.
 void CheckHorizonGrowth(const TrainingSpec& spec, JsonFields* fields) {
   if (spec.horizon_growth_iterations == 0) return;
-  if (spec.algorithm == Algorithm::kGaussianPrior) {
-    fields->Fail("horizon_growth_iterations", "GAUSSIAN_PRIOR has no iterations; its first fits grow their rollouts by themselves");
-  } else if (spec.horizon_growth_iterations >= spec.iterations - spec.warmup_iterations) {
-    fields->Fail("horizon_growth_iterations", absl::StrCat("must leave some of the ", spec.iterations - spec.warmup_iterations,
+  const int32_t iterations = OuterIterations(spec) - spec.warmup_iterations;
+  if (OuterIterations(spec) == 0) {
+    fields->Fail("horizon_growth_iterations", "GAUSSIAN_PRIOR without meta_iterations has none; its first fits grow their rollouts by themselves");
+  } else if (spec.horizon_growth_iterations >= iterations) {
+    fields->Fail("horizon_growth_iterations", absl::StrCat("must leave some of the ", iterations,
                                                            " iterations after the warm-up for rollouts of full length"));
   }
 }
 
 /// Rates at the inverse curvature are found when the warm-up ends.
 void CheckCurvatureRates(const TrainingSpec& spec, JsonFields* fields) {
-  const int32_t iterations = spec.algorithm == Algorithm::kGaussianPrior ? spec.gaussian_prior.meta_iterations : spec.iterations;
+  const int32_t iterations = OuterIterations(spec);
   if (!spec.inner_loop.curvature_rates || spec.warmup_iterations < iterations) return;
   fields->Fail("warmup_iterations", absl::StrCat("must be less than the ", iterations,
                                                  " iterations if there are curvature_rates, which begin after the warm-up"));
@@ -166,6 +177,7 @@ void CheckLinearStart(const TrainingSpec& spec, JsonFields* fields) {
 void CheckRestarts(const TrainingSpec& spec, JsonFields* fields) {
   if (spec.restarts == 1) return;
   if (spec.algorithm == Algorithm::kGaussianPrior) fields->Fail("restarts", "GAUSSIAN_PRIOR has gaussian_prior.restarts");
+  if (spec.algorithm == Algorithm::kMixedEffects) fields->Fail("restarts", "MIXED_EFFECTS judges nothing, so it cannot choose among starts");
   if (spec.screening_iterations == 0 || spec.screening_iterations > spec.iterations) {
     fields->Fail("screening_iterations", absl::StrCat("must be from 1 to the ", spec.iterations, " iterations if there are restarts"));
   }
@@ -196,6 +208,11 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
     adaptation.steps = kGaussianPriorSteps;
   }
   spec.adaptation = ReadInnerLoop(&fields, "adaptation", adaptation);
+  if (spec.algorithm == Algorithm::kGaussianPrior && spec.gaussian_prior.meta_iterations > 0 &&
+      spec.gaussian_prior.meta_algorithm == Algorithm::kMixedEffects && spec.adaptation.adapted_mask != spec.inner_loop.adapted_mask) {
+    fields.Fail("adaptation.adapted_mask", absl::StrCat("is \"", spec.adaptation.adapted_mask, "\", but the prior begins with what MIXED_EFFECTS finds for inner_loop.adapted_mask, \"",
+                                                        spec.inner_loop.adapted_mask, "\": they must be the same"));
+  }
   const auto positive = [&fields](const std::string& name, int32_t default_value) {
     const int32_t value = static_cast<int32_t>(fields.Integer(name, default_value, 0, kMany));
     return value == 0 ? default_value : value;
@@ -235,6 +252,7 @@ json ToJson(const TrainingSpec& spec) {
           {"adaptation", InnerLoopJson(spec.adaptation)},
           {"gaussian_prior",
            {{"meta_iterations", spec.gaussian_prior.meta_iterations},
+            {"meta_algorithm", NameOf(kAlgorithms, spec.gaussian_prior.meta_algorithm)},
             {"initial_std", spec.gaussian_prior.initial_std},
             {"rounds", spec.gaussian_prior.rounds},
             {"restarts", spec.gaussian_prior.restarts},

@@ -9,7 +9,7 @@
 
 namespace metaekf::meta {
 
-enum class Algorithm { kMaml, kFirstOrderMaml, kSupervised, kGaussianPrior, kReptile, kImplicitMaml };
+enum class Algorithm { kMaml, kFirstOrderMaml, kSupervised, kGaussianPrior, kReptile, kImplicitMaml, kMixedEffects };
 
 enum class Optimiser { kGradientDescent, kAdam, kLevenbergMarquardt };
 
@@ -21,7 +21,7 @@ struct InnerLoopSpec {
   double learning_rate = 0.01;
   std::string adapted_mask = "*";
   Optimiser optimiser = Optimiser::kGradientDescent;
-  double proximal = 1;  ///< λ of kImplicitMaml, and of kLevenbergMarquardt where no prior has been learned
+  double proximal = 1;  ///< λ of kImplicitMaml and kMixedEffects, and of kLevenbergMarquardt where no prior has been learned
   bool learned_rates = false;
   bool curvature_rates = false;
   std::map<std::string, double> tensor_rates;  ///< by the tensor's name; the others' is learning_rate
@@ -32,6 +32,7 @@ enum class PriorCovariance { kFull, kLowRank, kBlock, kManifold };
 /// Empirical Bayes: the message GaussianPriorSpec of spec.proto.
 struct GaussianPriorSpec {
   int32_t meta_iterations = 0;
+  Algorithm meta_algorithm = Algorithm::kMaml;  ///< or kMixedEffects
   double initial_std = 0.1;
   int32_t rounds = 6;
   int32_t restarts = 6;

@@ -18,6 +18,8 @@ struct FilterNoise {
   Eigen::MatrixXd process;      ///< Q, n × n
   Eigen::MatrixXd measurement;  ///< R, n_y × n_y
   Eigen::MatrixXd initial;      ///< covariance of the first state, n × n
+  /// How far a system's own Q and R are from these: standard deviation of the logarithm of a variance over the fleet.
+  double log_std = 1;
 };
 
 struct ChannelNames {

@@ -212,7 +212,8 @@ std::string WriteModelFile(const Bundle& bundle) {
       {"noise",
        {{"process_cov", ListOf(bundle.noise.process)},
         {"measurement_cov", ListOf(bundle.noise.measurement)},
-        {"initial_cov", ListOf(bundle.noise.initial)}}},
+        {"initial_cov", ListOf(bundle.noise.initial)},
+        {"log_std", bundle.noise.log_std}}},
       {"training", bundle.training},
       {"provenance", bundle.provenance},
   };
@@ -257,6 +258,7 @@ absl::StatusOr<Bundle> ReadModelFile(const std::string& bytes) {
   bundle.noise.process = ReadCovariance(&noise_fields, noise, "process_cov", filter_size);
   bundle.noise.measurement = ReadCovariance(&noise_fields, noise, "measurement_cov", spec.output_size);
   bundle.noise.initial = ReadCovariance(&noise_fields, noise, "initial_cov", filter_size);
+  bundle.noise.log_std = noise_fields.Number("log_std", FilterNoise().log_std, 0, 1e3);
   METAEKF_RETURN_IF_ERROR(noise_fields.status());
   METAEKF_RETURN_IF_ERROR(fields.status());
   bundle.training = object.value("training", json::object());

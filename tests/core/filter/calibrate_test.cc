@@ -11,7 +11,7 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-constexpr CalibrationPrior kNoPrior;
+constexpr double kNoPrior = std::numeric_limits<double>::infinity();
 
 std::vector<CalibrationRun> Runs(const nssm::Bundle& bundle, int count, Index steps) {
   std::vector<CalibrationRun> runs;
@@ -80,8 +80,21 @@ TEST(CalibrateTest, CountsThatErrorsOfAModelLast) {
 TEST(CalibrateTest, AStrongPriorKeepsWhatIsThere) {
   nssm::Bundle bundle = LinearBundle(LinearSystem());
   bundle.noise.process *= 5;
-  const nssm::FilterNoise kept = Calibrate(bundle, Runs(bundle, 1, 100), {1e-3, 1e-3}, base::CallingThread());
+  const nssm::FilterNoise kept = Calibrate(bundle, Runs(bundle, 1, 100), 1e-3, base::CallingThread());
   EXPECT_NEAR(kept.process(0, 0) / bundle.noise.process(0, 0), 1, 0.01);
+  EXPECT_EQ(Calibrate(bundle, Runs(bundle, 1, 100), 0, base::CallingThread()).process, bundle.noise.process);
+}
+
+TEST(CalibrateTest, WhatItFindsExplainsRecordingsBetter) {
+  nssm::Bundle bundle = LinearBundle(LinearSystem());
+  const std::vector<CalibrationRun> runs = Runs(bundle, 3, 300);
+  const double of_truth = LogLikelihood(bundle, runs, base::CallingThread());
+  bundle.noise.process *= 20;
+  const double of_guess = LogLikelihood(bundle, runs, base::CallingThread());
+  bundle.noise = Calibrate(bundle, runs, kNoPrior, base::CallingThread());
+  const double of_found = LogLikelihood(bundle, runs, base::CallingThread());
+  EXPECT_GT(of_truth, of_guess + 0.1);
+  EXPECT_GT(of_found, of_truth - 0.01);
 }
 
 TEST(CalibrateTest, AModelThatDivergesKeepsItsNoise) {

@@ -17,6 +17,8 @@ namespace metaekf::meta {
 namespace {
 
 using data::Dataset;
+using Eigen::Index;
+using Eigen::MatrixXd;
 using data::Trajectory;
 
 std::string TrainedFile(const TrainingSpec& spec, size_t threads, const TrainingState* resume = nullptr) {
@@ -61,11 +63,15 @@ std::vector<Variant> Variants() {
   by_least_squares.loss.reconstruction_weight = 0;
   by_least_squares.inner_loop.proximal = by_least_squares.adaptation.proximal = 0.3;
   by_least_squares.inner_loop.steps = by_least_squares.adaptation.steps = 12;
-  add("GaussianPriorAfterMaml", Algorithm::kGaussianPrior, Optimiser::kGradientDescent, true);
-  TrainingSpec& prior = variants.back().spec;
-  prior.gaussian_prior = {.meta_iterations = 20, .rounds = 1, .first_steps = 4, .round_steps = 3};
-  prior.inner_loop.adapted_mask = "transition.1";
-  prior.adaptation = {.steps = 5, .adapted_mask = "transition.1", .optimiser = Optimiser::kLevenbergMarquardt};
+  add("MixedEffects", Algorithm::kMixedEffects, Optimiser::kGradientDescent, false);
+  for (const Algorithm meta : {Algorithm::kMaml, Algorithm::kMixedEffects}) {
+    add(meta == Algorithm::kMaml ? "GaussianPriorAfterMaml" : "GaussianPriorAfterMixedEffects", Algorithm::kGaussianPrior,
+        Optimiser::kGradientDescent, meta == Algorithm::kMaml);
+    TrainingSpec& prior = variants.back().spec;
+    prior.gaussian_prior = {.meta_iterations = 20, .meta_algorithm = meta, .rounds = 1, .first_steps = 4, .round_steps = 3};
+    prior.inner_loop.adapted_mask = "transition.1";
+    prior.adaptation = {.steps = 5, .adapted_mask = "transition.1", .optimiser = Optimiser::kLevenbergMarquardt};
+  }
   return variants;
 }
 
@@ -175,6 +181,7 @@ TEST(RestartsTest, IfAllStartsDivergeTheTrainingHas) {
 
 TEST_P(EveryAlgorithmTest, LowersTheLossOfHeldOutSystems) {
   if (GetParam().spec.algorithm == Algorithm::kGaussianPrior) GTEST_SKIP() << "MAML and the rounds after it are judged by different losses";
+  if (GetParam().spec.algorithm == Algorithm::kMixedEffects) GTEST_SKIP() << "effects of training systems are no model of others";
   TrainingSpec spec = GetParam().spec;
   spec.iterations = 200;
   std::vector<double> losses;
@@ -234,6 +241,79 @@ TEST(TrainTest, APriorAfterMamlKeepsWhatDoesNotAdapt) {
     if (!same) adapted += tensor.size();
   }
   EXPECT_EQ(prior->prior->dynamics.rows(), adapted);
+}
+
+// x⁺ = x + 0.1 (−x + u + c) with c of a system's own: a linear model with a bias for every system has D δ_s = 0.1 (c_s − mean c).
+TEST(TrainTest, MixedEffectsAreWhatSystemsDifferIn) {
+  constexpr Index kSystems = 6, kSteps = 80;
+  data::Dataset fleet{.input_names = {"u1"}, .output_names = {"y1"}, .state_names = {"x1"}};
+  Eigen::RowVectorXd c(kSystems);
+  for (Index s = 0; s < kSystems; ++s) {
+    base::Rng rng(3, static_cast<uint64_t>(s));
+    c[s] = rng.Normal();
+    data::Trajectory t{.name = std::to_string(s), .sample_period_s = 0.1, .inputs = MatrixXd(1, kSteps), .states = MatrixXd(1, kSteps)};
+    double x = rng.Normal();
+    for (Index k = 0; k < kSteps; ++k) {
+      t.inputs(0, k) = rng.Normal();
+      t.states(0, k) = x;
+      x += 0.1 * (-x + t.inputs(0, k) + c[s]);
+    }
+    t.outputs = t.states;
+    fleet.trajectories.push_back(std::move(t));
+  }
+  TrainingSpec spec = SmallSpec();
+  spec.algorithm = Algorithm::kMixedEffects;
+  spec.model.transition.block.hidden_widths = {};
+  spec.inner_loop.adapted_mask = "transition.0.bias";
+  spec.inner_loop.proximal = 0;
+  spec.validation_share = 0;
+  spec.iterations = 2000;
+  spec.final_outer_lr = 1e-4;
+  std::vector<double> variables;
+  const absl::StatusOr<nssm::Bundle> bundle = Train(spec, fleet, nullptr, base::CallingThread(), [&variables](const TrainingProgress& progress) {
+    variables = progress.state.values.at("parameters");
+    return true;
+  });
+  ASSERT_TRUE(bundle.ok()) << bundle.status();
+  const Index size = bundle->model.layout().size(), adapted = 3;
+  ASSERT_EQ(static_cast<Index>(variables.size()), size + kSystems * adapted);
+  const Eigen::Map<const MatrixXd> own(variables.data() + size, adapted, kSystems);
+  const nn::ParameterLayout& layout = bundle->model.layout();
+  std::vector<double> parameters = bundle->parameters;
+  const MatrixXd decoder = nn::TensorIn(layout, "state_decoder.0.weight", parameters);
+  const Eigen::RowVectorXd effect = decoder * own, expected = 0.1 * (c.array() - c.mean()) / bundle->normaliser.states.scale[0];
+  EXPECT_LT(((effect.array() - effect.mean()).matrix() - expected).norm(), 0.02 * expected.norm()) << effect << "\n" << expected;
+  // Their mean is the model's.
+  const MatrixXd bias = nn::TensorIn(layout, "transition.0.bias", parameters);
+  std::vector<double> shared(variables.begin(), variables.begin() + size);
+  EXPECT_LT((bias - nn::TensorIn(layout, "transition.0.bias", shared) - own.rowwise().mean()).norm(), 1e-12);
+}
+
+// Sensors that are alike in one fleet and differ by powers of ten in the other: what a context says of its own noise counts there.
+TEST(TrainTest, HowFarSystemsNoisesAreApartIsLearned) {
+  const auto log_std = [](double spread) {
+    data::Dataset fleet = Fleet(20, 400, 1);
+    for (size_t s = 0; s < fleet.trajectories.size(); ++s) {
+      base::Rng rng(9, s);
+      data::Trajectory& system = fleet.trajectories[s];
+      for (Index t = 0; t + 1 < system.length(); ++t) {  // the same a and the same disturbances for all
+        system.states(0, t + 1) = 0.9 * system.states(0, t) + 0.1 * system.inputs(0, t) + 0.02 * rng.Normal();
+      }
+      system.outputs = system.states;
+      const double noise_std = 0.02 * std::exp(spread * rng.Normal());
+      for (double& y : fleet.trajectories[s].outputs.reshaped()) y += noise_std * rng.Normal();
+    }
+    TrainingSpec spec = SmallSpec();
+    spec.model.transition.block.hidden_widths = {};
+    spec.inner_loop.steps = spec.adaptation.steps = 0;
+    spec.iterations = 300;
+    spec.validation_share = 0.4;
+    spec.context_samples = 100;
+    return Train(spec, fleet, nullptr, base::CallingThread(), nullptr)->noise.log_std;
+  };
+  const double alike = log_std(0), apart = log_std(1);
+  EXPECT_LE(alike, 0.5);
+  EXPECT_GE(apart, 1);
 }
 
 // A field is a thousandth of its positions, in units of its own: both are of order one inside a model, and so are its gradients.

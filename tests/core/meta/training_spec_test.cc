@@ -99,6 +99,12 @@ TEST(TrainingSpecTest, WhatAnAlgorithmCannotUseIsRefusedByName) {
   expect_refused({{"restarts", 2}, {"screening_iterations", 101}, {"iterations", 100}}, "screening_iterations");
   expect_refused({{"restarts", 2}, {"screening_iterations", 10}, {"validation_share", 0}}, "validation_share");
   expect_refused({{"algorithm", "GAUSSIAN_PRIOR"}, {"restarts", 2}, {"screening_iterations", 10}}, "restarts");
+  expect_refused({{"algorithm", "MIXED_EFFECTS"}, {"restarts", 2}, {"screening_iterations", 10}}, "restarts");
+  expect_refused({{"algorithm", "GAUSSIAN_PRIOR"}, {"gaussian_prior", {{"meta_algorithm", "REPTILE"}}}}, "gaussian_prior.meta_algorithm");
+  const json mixed = {{"meta_iterations", 10}, {"meta_algorithm", "MIXED_EFFECTS"}};
+  expect_refused({{"algorithm", "GAUSSIAN_PRIOR"}, {"gaussian_prior", mixed}, {"inner_loop", {{"adapted_mask", "encoder"}}}, {"adaptation", {{"adapted_mask", "transition"}}}},
+                 "adaptation.adapted_mask");
+  expect_refused({{"algorithm", "GAUSSIAN_PRIOR"}, {"gaussian_prior", mixed}, {"inner_loop", learned}}, "inner_loop.learned_rates");
   expect_refused({{"gaussian_prior", {{"rank", 2}}}}, "gaussian_prior.rank");
   expect_refused({{"gaussian_prior", {{"covariance", "BLOCK"}, {"rank", 2}}}}, "gaussian_prior.rank");
   expect_refused({{"gaussian_prior", {{"covariance", "LOW_RANK"}}}}, "gaussian_prior.rank");
