@@ -82,7 +82,8 @@ std::vector<double> PressureOrder() {
 }
 
 std::vector<Learner> VaporCompressionLearners(Budget budget) {
-  const json order = {{"model", {{"state_constraint", {{"polyhedron", {{"matrix", PressureOrder()}}}}}}}};
+  // The layer begins as the identity up to its edge; what it could learn the decoder learns, too.
+  const json order = {{"model", {{"state_constraint", {{"polyhedron", {{"matrix", PressureOrder()}}}}}}}, {"frozen_mask", "state_constraint"}};
   const auto recipe = [budget](const char* own, const char* quick, const char* tiny) {
     json merged = Merged(Parsed(kCommon), Parsed(own));
     if (budget == Budget::kQuick) return Merged(std::move(merged), Parsed(quick));

@@ -25,6 +25,8 @@ constexpr int kRounds = 6;               // of a model that follows its system t
 constexpr double kLargestMove = 2;       // of ln d²
 constexpr double kLeastShare = 0.2;      // of a move
 constexpr double kLargest = 30;          // |ln d²|: 10¹³
+constexpr double kSearchWork = 16000;    // samples of one entry; a search over n entries takes some n^1.5 times as long
+constexpr Index kFewestSamples = 50;
 constexpr double kFailed = -std::numeric_limits<double>::infinity();
 
 /// Where a scale acts.
@@ -64,7 +66,7 @@ struct Prepared {
   const data::Trajectory* trajectory = nullptr;
   std::shared_ptr<const FilterModel::Parameters> parameters;
   FilterState start;
-  Index begin = 0;
+  Index begin = 0, end = 0;  ///< of the samples that count
 };
 
 absl::StatusOr<Ekf> MakeFilter(const nssm::Bundle& bundle, const nssm::FilterNoise& noise,
@@ -116,7 +118,7 @@ Score ScoreOf(const nssm::Bundle& bundle, const nssm::FilterNoise& noise, const 
   double sum = 0;
   int64_t samples = 0;
   VectorXd squares = VectorXd::Zero(states + outputs), counts = squares;
-  for (Index t = run.begin; t < run.trajectory->length(); ++t) {
+  for (Index t = run.begin; t < run.end; ++t) {
     if (!ekf->Step(run.trajectory->inputs.col(t), run.trajectory->outputs.col(t), scratch.get(), &estimate).ok()) return {};
     if (estimate.measured == 0) continue;
     sum += LogLikelihood(estimate, bundle.normaliser.outputs.scale);
@@ -155,8 +157,19 @@ absl::StatusOr<std::vector<Prepared>> PrepareAll(const nssm::Bundle& bundle, con
   for (const CalibrationRun& run : runs) {
     prepared.push_back({&run.trajectory, model->Prepare(run.parameters), {}});
     METAEKF_RETURN_IF_ERROR(Begin(bundle, model, &prepared.back()));
+    prepared.back().end = run.trajectory.length();
   }
   return prepared;
+}
+
+/// The samples of each run that a search over every entry looks at.
+Index SearchSamples(const Layout& layout) {
+  return std::max(kFewestSamples, static_cast<Index>(kSearchWork / std::pow(static_cast<double>(layout.size()), 1.5)));
+}
+
+std::vector<Prepared> FirstOf(std::vector<Prepared> runs, Index samples) {
+  for (Prepared& run : runs) run.end = std::min(run.end, run.begin + samples);
+  return runs;
 }
 
 /// Mean over runs.
@@ -190,30 +203,33 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
   if (!prepared.ok()) return bundle.noise;
   const Layout layout{.process = bundle.model.spec().is_case_one() ? 1 : bundle.noise.process.rows(),
                       .measurement = bundle.noise.measurement.rows()};
-  const auto score = [&](const VectorXd& log_scales) {
+  const auto score = [&](const std::vector<Prepared>& of, const VectorXd& log_scales) {
     if (log_scales.lpNorm<Eigen::Infinity>() > kLargest) return Score();
-    Score found = ScoreOfAll(bundle, Scaled(bundle.noise, log_scales, layout), model, *prepared, executor);
+    Score found = ScoreOfAll(bundle, Scaled(bundle.noise, log_scales, layout), model, of, executor);
     found.likelihood -= 0.5 * (log_scales / log_std).squaredNorm();
     return found;
   };
-  const auto objective = [&](const VectorXd& log_scales) { return score(log_scales).likelihood; };
-
   VectorXd best = VectorXd::Zero(layout.size());
-  Score found = score(best);
-  // Where every entry has an error of its own, first all of them at once towards what makes that as large as expected: not the
+  // Where every entry has an error of its own, all of them at once towards what makes that as large as expected: not the
   // most likely yet, but near it, in few evaluations whatever their number.
-  const bool moves = found.squares.size() == layout.size();
-  for (double share = 1; moves && found.likelihood > kFailed && share >= kLeastShare;) {
-    const VectorXd move = found.squares.array().log().max(-kLargestMove).min(kLargestMove);
-    const Score trial = score(best + share * move);
-    if (trial.likelihood > found.likelihood + kWorthwhile * static_cast<double>(layout.size())) {
-      best += share * move;
-      found = trial;
-    } else {
-      share /= 2;
+  const auto match_errors = [&](const std::vector<Prepared>& of) {
+    Score found = score(of, best);
+    const bool moves = found.squares.size() == layout.size();
+    for (double share = 1; moves && found.likelihood > kFailed && share >= kLeastShare;) {
+      const VectorXd move = found.squares.array().log().max(-kLargestMove).min(kLargestMove);
+      const Score trial = score(of, best + share * move);
+      if (trial.likelihood > found.likelihood + kWorthwhile * static_cast<double>(layout.size())) {
+        best += share * move;
+        found = trial;
+      } else {
+        share /= 2;
+      }
     }
-  }
-  double value = found.likelihood;
+  };
+  match_errors(*prepared);
+  const std::vector<Prepared> beginnings = FirstOf(*prepared, SearchSamples(layout));
+  const auto objective = [&](const VectorXd& log_scales) { return score(beginnings, log_scales).likelihood; };
+  double value = objective(best);
   const auto improve = [&](const VectorXd& move) {
     for (double share = 1; share >= kLeastShare; share /= 2) {
       const double trial = objective(best + share * move);
@@ -236,6 +252,8 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
     for (Index i = 0; i < move.size(); ++i) move[i] = TopOfParabola(objective, best, value, VectorXd::Unit(move.size(), i));
     improve(move);
   }
+  // Beginnings do not know of errors that take long to grow.
+  if (beginnings.front().end < prepared->front().end) match_errors(*prepared);
   return Scaled(bundle.noise, best, layout);
 }
 

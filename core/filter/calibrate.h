@@ -25,7 +25,8 @@ struct CalibrationRun {
 /// the sum over states i in Case II, where they are recorded and filters begin at the first of them. In Case I, whose latents have no
 /// axes of their own, D_q is a multiple of the identity. In Case II first all at once in proportion to the errors; then, in ln d², all of Q, all of R and
 /// every entry go to the tops of parabolas through three values each, until a round is worth less than 1e-3 an
-/// entry, six times at most.
+/// entry, six times at most. These look at the beginnings of recordings alone where there are many entries, and all move in proportion to
+/// the errors of whole recordings once more: some errors take long to grow.
 ///
 /// @param bundle  with Q₀, R₀ and P₀ in its noise. @param runs  at least one, of systems that the parameters were not fitted to, or of
 ///   samples that come after those. @param log_std  s of ln d², beside the mean over

@@ -289,6 +289,10 @@ LearnedStart TakeApart(const TrainingSpec& spec, const nssm::Model& model, const
   return result;
 }
 
+nn::Mask FrozenTensors(const TrainingSpec& spec, const nssm::Model& model) {
+  return spec.frozen_mask.empty() ? nn::Mask(model.layout().tensors().size(), false) : *nn::ParseMask(spec.frozen_mask, model.layout());
+}
+
 /// One training, from its state on.
 template <typename T>
 class OuterLoop {
@@ -298,6 +302,7 @@ class OuterLoop {
       : spec_(spec),
         model_(model),
         mask_(mask),
+        frozen_(FrozenTensors(spec, model)),
         systems_(systems),
         state_(state),
         schedule_(spec),
@@ -402,6 +407,10 @@ class OuterLoop {
       }
     }
     const double loss = phase.Gradient(iteration, parameters, &gradient_);
+    for (size_t i = 0; i < frozen_.size(); ++i) {
+      const nn::Tensor& tensor = model_.layout().tensors()[i];
+      if (frozen_[i]) std::fill_n(gradient_.begin() + tensor.offset, tensor.size(), 0.0);
+    }
     const double norm = ClipNorm(spec_.clip_norm, &gradient_);
     const int32_t step = iteration + 1 - (warming_up ? 0 : spec_.warmup_iterations);
     const double first_loss = step == 1 ? loss : state_->values[kFirstLoss].front();
@@ -443,6 +452,7 @@ class OuterLoop {
   const TrainingSpec& spec_;
   const nssm::Model& model_;
   const nn::Mask& mask_;
+  const nn::Mask frozen_;
   const Systems& systems_;
   TrainingState* state_;
   const Schedule schedule_;
@@ -479,6 +489,7 @@ absl::StatusOr<LearnedStart> RunOuterLoop(const TrainingSpec& spec, const nssm::
     return absl::InvalidArgumentError(
         "restarts: there is no system to choose among starts by; a larger validation_share holds some out");
   }
+  METAEKF_RETURN_IF_ERROR(base::Annotate(nn::ParseMask(spec.frozen_mask, model.layout()).status(), "frozen_mask"));
   METAEKF_RETURN_IF_ERROR(Prepare(spec, model, mask, systems, state));
   METAEKF_RETURN_IF_ERROR(spec.model.precision == nssm::Precision::kFloat32
                               ? OuterLoop<float>(spec, model, mask, systems, executor, state).Run(on_step)

@@ -91,11 +91,10 @@ absl::StatusOr<LearnedStart> SharedParameters(const TrainingSpec& spec, const ns
   return learned;
 }
 
-/// What a filter of a system is calibrated on: at most so many samples behind its context, fewer the more there is to be found, or all
-/// of a recording that is hardly longer than that.
+/// What a filter of a system is calibrated on: at most so many samples behind its context, or all of a recording that is hardly longer
+/// than that.
 constexpr int64_t kCalibrationSamples = 2000, kFewSamples = 50;
 constexpr double kLogStds[] = {0, 0.25, 0.5, 1, 2};
-constexpr double kCalibrationWork = 16000;  // samples of one channel; a search over n channels takes some n^1.5 times as long
 
 /// How far systems' own Q and R are from the fleet's (FilterNoise::log_std): with which of kLogStds what the tails of contexts say
 /// helps most to explain what comes after.
@@ -135,8 +134,6 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const Trai
     // An adaptation that diverges says nothing about noise; the unadapted model stands in.
     parameters[i] = adapted.ok() ? *std::move(adapted) : bundle.parameters;
   });
-  const double channels = spec.model.state_size + spec.model.output_size;
-  const int64_t most = std::clamp(static_cast<int64_t>(kCalibrationWork / std::pow(channels, 1.5)), kFewSamples, kCalibrationSamples);
   filter::NoiseEstimate noise(bundle);
   std::vector<filter::CalibrationRun> runs, later_runs;
   std::vector<Trajectory> contexts;  // of the later runs
@@ -145,7 +142,7 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const Trai
     noise.Add(parameters[i], normalised);
     const int64_t begin = systems[i].length() - wanted < kFewSamples ? 0 : wanted;
     METAEKF_ASSIGN_OR_RETURN(const Trajectory later, data::SamplesFrom(systems[i], begin));
-    METAEKF_ASSIGN_OR_RETURN(Trajectory run, data::FirstSamples(later, std::min<int64_t>(later.length(), most)));
+    METAEKF_ASSIGN_OR_RETURN(Trajectory run, data::FirstSamples(later, std::min(later.length(), kCalibrationSamples)));
     runs.push_back({parameters[i], std::move(run)});
     if (begin == 0) continue;
     METAEKF_ASSIGN_OR_RETURN(Trajectory context, data::FirstSamples(systems[i], wanted));

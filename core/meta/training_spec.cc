@@ -222,6 +222,7 @@ absl::StatusOr<TrainingSpec> ReadTrainingSpec(const json& object) {
   spec.contexts_at_start = fields.Bool("contexts_at_start", spec.contexts_at_start);
   spec.linear_start = fields.Bool("linear_start", spec.linear_start);
   CheckLinearStart(spec, &fields);
+  spec.frozen_mask = fields.String("frozen_mask", spec.frozen_mask);
   spec.task_batch = positive("task_batch", spec.task_batch);
   spec.iterations = positive("iterations", spec.iterations);
   spec.restarts = positive("restarts", spec.restarts);
@@ -265,6 +266,7 @@ json ToJson(const TrainingSpec& spec) {
           {"target_samples", spec.target_samples},
           {"contexts_at_start", spec.contexts_at_start},
           {"linear_start", spec.linear_start},
+          {"frozen_mask", spec.frozen_mask},
           {"task_batch", spec.task_batch},
           {"iterations", spec.iterations},
           {"restarts", spec.restarts},

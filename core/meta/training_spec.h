@@ -61,6 +61,7 @@ struct TrainingSpec {
   int32_t target_samples = 100;
   bool contexts_at_start = false;
   bool linear_start = false;
+  std::string frozen_mask;  ///< empty: nothing
   int32_t task_batch = 8;
   int32_t iterations = 1000;
   int32_t restarts = 1;

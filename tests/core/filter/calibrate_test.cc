@@ -97,6 +97,19 @@ TEST(CalibrateTest, WhatItFindsExplainsRecordingsBetter) {
   EXPECT_GT(of_found, of_truth - 0.01);
 }
 
+// Longer than what a search looks at.
+TEST(CalibrateTest, WhatComesLateInARecordingCounts) {
+  constexpr Index kSteps = 4000;
+  nssm::Bundle bundle = LinearBundle(LinearSystem());
+  std::vector<CalibrationRun> runs = Runs(bundle, 1, kSteps);
+  base::Rng rng(5);
+  const double noise_std = std::sqrt(8 * bundle.noise.measurement(0, 0));
+  for (Index t = kSteps / 2; t < kSteps; ++t) runs[0].trajectory.outputs(0, t) += noise_std * rng.Normal();
+  const nssm::FilterNoise found = Calibrate(bundle, runs, kNoPrior, base::CallingThread());
+  EXPECT_NEAR(found.measurement(0, 0) / bundle.noise.measurement(0, 0), 5, 1.5);
+  EXPECT_NEAR(found.measurement(1, 1) / bundle.noise.measurement(1, 1), 1, 0.2);
+}
+
 TEST(CalibrateTest, AModelThatDivergesKeepsItsNoise) {
   LinearSystem explosive;
   explosive.A *= 1e9;

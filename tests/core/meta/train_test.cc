@@ -316,6 +316,27 @@ TEST(TrainTest, HowFarSystemsNoisesAreApartIsLearned) {
   EXPECT_GE(apart, 1);
 }
 
+TEST(TrainTest, FrozenTensorsStayWhereTheyBegin) {
+  TrainingSpec spec = SmallSpec();
+  const auto trained = [&spec] { return *Train(spec, Fleet(10, 80, 1), nullptr, base::CallingThread(), nullptr); };
+  const nssm::Bundle all = trained();
+  spec.frozen_mask = "encoder,transition.0.weight";
+  const nssm::Bundle some = trained();
+  const std::vector<double> start = some.model.InitialParameters(spec.seed);
+  for (const nn::Tensor& tensor : some.model.layout().tensors()) {
+    const auto values = [&tensor](const std::vector<double>& of) {
+      return std::vector<double>(of.begin() + tensor.offset, of.begin() + tensor.offset + tensor.size());
+    };
+    const bool frozen = tensor.name.starts_with("encoder") || tensor.name == "transition.0.weight";
+    EXPECT_EQ(values(some.parameters) == values(start), frozen) << tensor.name;
+    EXPECT_NE(values(all.parameters), values(start)) << tensor.name;
+  }
+  spec.frozen_mask = "engine";
+  const absl::StatusOr<nssm::Bundle> wrong = Train(spec, Fleet(10, 80, 1), nullptr, base::CallingThread(), nullptr);
+  EXPECT_NE(std::string(wrong.status().message()).find("frozen_mask"), std::string::npos) << wrong.status();
+  EXPECT_NE(std::string(wrong.status().message()).find("engine"), std::string::npos) << wrong.status();
+}
+
 // A field is a thousandth of its positions, in units of its own: both are of order one inside a model, and so are its gradients.
 TEST(TrainTest, AFieldAndItsPositionsHaveScalesOfTheirOwn) {
   Dataset fleet = Fleet(10, 80, 1);
