@@ -22,12 +22,13 @@ absl::StatusOr<nssm::Bundle> AdaptForFilter(const nssm::Bundle& model, const dat
   nssm::Bundle adapted = model;
   adapted.parameters = std::move(result.parameters);
   adapted.noise = std::move(result.noise);
+  adapted.posterior = std::move(result.posterior);
   return adapted;
 }
 
 absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,
                                              const data::Trajectory& recording, int64_t from, filter::FilterOptions options) {
-  const std::shared_ptr<const filter::FilterModel::Parameters> parameters = functions->Prepare(model.parameters);
+  const std::shared_ptr<const filter::FilterModel::Parameters> parameters = functions->Prepare(model);
   const std::unique_ptr<filter::FilterModel::Scratch> scratch = functions->MakeScratch();
   const data::Normaliser& units = model.normaliser;
   const bool case_one = model.model.spec().is_case_one();

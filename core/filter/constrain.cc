@@ -49,6 +49,21 @@ physics::Polyhedron InUnits(const physics::Polyhedron& set, const VectorXd& mean
   return normalised;
 }
 
+physics::Polyhedron WithFree(const physics::Polyhedron& set, Index r) {
+  const Index n = set.dimension();
+  const auto below = [r](const MatrixXd& columns) {
+    MatrixXd whole = MatrixXd::Zero(columns.rows() + r, columns.cols());
+    whole.topRows(columns.rows()) = columns;
+    return whole;
+  };
+  physics::Polyhedron free{.G = MatrixXd::Zero(set.G.rows(), n + r), .g = set.g, .rays = below(set.rays), .vertices = below(set.vertices),
+                           .lineality = MatrixXd::Zero(n + r, set.lineality.cols() + r)};
+  free.G.leftCols(n) = set.G;
+  free.lineality.topLeftCorner(set.lineality.rows(), set.lineality.cols()) = set.lineality;
+  free.lineality.bottomRightCorner(r, r).setIdentity();
+  return free;
+}
+
 double Slack(const physics::Polyhedron& set, const VectorXd& x) {
   double slack = std::numeric_limits<double>::infinity();
   for (Index i = 0; i < set.g.size(); ++i) {

@@ -38,4 +38,7 @@ double EdgeVariance(double alpha);
 /// A set in normalised units, x = mean + scale ∘ x̃: G diag(scale) x̃ ≤ g − G mean.
 physics::Polyhedron InUnits(const physics::Polyhedron& set, const Eigen::VectorXd& mean, const Eigen::VectorXd& scale);
 
+/// The set of [x; z] with x in a set and r free components z.
+physics::Polyhedron WithFree(const physics::Polyhedron& set, Eigen::Index r);
+
 }  // namespace metaekf::filter

@@ -72,7 +72,9 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
   ekf.next_input_ = spec.transition.input_time == nssm::InputTime::kNext;
   ekf.input_size_ = spec.input_size;
   ekf.output_size_ = spec.output_size;
-  ekf.state_size_ = ekf.model_->state_size();
+  ekf.model_size_ = ekf.model_->state_size();
+  const Index r = ekf.parameters_->directions();
+  ekf.state_size_ = ekf.model_size_ + static_cast<int32_t>(r);
   if (options.initial_samples != 0 && (ekf.case_one_ || options.initial_samples < 0 || options.initial_samples > kMaxInitialSamples)) {
     return absl::InvalidArgumentError(
         absl::StrCat("initial samples: must be from 0 to ", kMaxInitialSamples, ", and 0 in Case I, got ", options.initial_samples));
@@ -83,9 +85,9 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
   const physics::Polyhedron* const set = ekf.case_one_ ? bundle.model.output_set() : bundle.model.state_set();
   if (set != nullptr) ekf.set_ = *set;
   if (set != nullptr && !ekf.case_one_) {
-    ekf.normalised_set_ = InUnits(*set, bundle.normaliser.states.mean, bundle.normaliser.states.scale);
+    ekf.normalised_set_ = WithFree(InUnits(*set, bundle.normaliser.states.mean, bundle.normaliser.states.scale), r);
   }
-  const Index n = ekf.state_size_, n_y = ekf.output_size_;
+  const Index n = ekf.model_size_, n_y = ekf.output_size_, joint = ekf.state_size_;
   const VectorXd state_scale = ekf.case_one_ ? VectorXd::Ones(n) : bundle.normaliser.states.scale;
 
   const MatrixXd Q = options.process_cov.value_or(bundle.noise.process);
@@ -98,18 +100,26 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
     if (!result.ok()) return base::Annotate(result.status(), name);
     return result;
   };
-  METAEKF_ASSIGN_OR_RETURN(ekf.process_factor_, factor("process noise covariance Q", Normalised(Q, state_scale)));
-  METAEKF_ASSIGN_OR_RETURN(ekf.initial_factor_, factor("initial covariance", Normalised(P, state_scale)));
+  const auto with_z = [&](const MatrixXd& of_state, double of_z) {
+    MatrixXd whole = MatrixXd::Zero(joint, joint);
+    whole.topLeftCorner(n, n) = of_state;
+    whole.diagonal().tail(r).setConstant(of_z);
+    return whole;
+  };
+  METAEKF_ASSIGN_OR_RETURN(const MatrixXd process_factor, factor("process noise covariance Q", Normalised(Q, state_scale)));
+  METAEKF_ASSIGN_OR_RETURN(const MatrixXd initial_factor, factor("initial covariance", Normalised(P, state_scale)));
+  ekf.process_factor_ = with_z(process_factor, 0);
+  ekf.initial_factor_ = with_z(initial_factor, 1);
   METAEKF_ASSIGN_OR_RETURN(ekf.measurement_cov_, NormalisedNoise(R, bundle.normaliser.outputs.scale));
 
-  ekf.initial_mean_ = VectorXd::Zero(n);
+  ekf.initial_mean_ = VectorXd::Zero(joint);
   if (options.initial_mean) {
     if (ekf.case_one_) return absl::InvalidArgumentError("initial mean: in Case I the first window gives the latent");
     if (options.initial_mean->size() != n || !options.initial_mean->allFinite()) {
       return absl::InvalidArgumentError(absl::StrCat("initial mean: expected ", n, " finite numbers, got ",
                                                      options.initial_mean->size()));
     }
-    ekf.initial_mean_ = bundle.normaliser.states.Normalise(*options.initial_mean);
+    ekf.initial_mean_.head(n) = bundle.normaliser.states.Normalise(*options.initial_mean);
   }
   if (!(options.gate.probability >= 0 && options.gate.probability < 1) || options.gate.recover_after < 1) {
     return absl::InvalidArgumentError(
@@ -128,17 +138,18 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
   ekf.state_.window.reserve(ekf.window_size_);
   ekf.u_.resize(ekf.input_size_);
   ekf.y_.resize(n_y);
-  ekf.value_.resize(n);
+  ekf.value_.resize(joint);
+  ekf.latent_.resize(n);
   ekf.h_.resize(n_y);
   ekf.whitened_.resize(n_y);
   ekf.measured_.reserve(static_cast<size_t>(n_y));
-  ekf.prior_factor_.resize(n, n);
-  ekf.F_.resize(n, n);
-  ekf.H_.resize(n_y, n);
-  ekf.H_rows_.resize(n_y, n);
-  ekf.time_work_.resize(n, 2 * n);
-  ekf.update_work_.resize(n + n_y, n + n_y);
-  ekf.product_.resize(std::max(n, n_y), n);
+  ekf.prior_factor_.resize(joint, joint);
+  ekf.F_.resize(joint, joint);
+  ekf.H_.resize(n_y, joint);
+  ekf.H_rows_.resize(n_y, joint);
+  ekf.time_work_.resize(joint, 2 * joint);
+  ekf.update_work_.resize(joint + n_y, joint + n_y);
+  ekf.product_.resize(std::max(n, n_y), joint);
   return ekf;
 }
 
@@ -242,7 +253,8 @@ void Ekf::FillWindow(FilterModel::Scratch* scratch) {
 void Ekf::BeginFromWindow(FilterModel::Scratch* scratch) {
   const Index size = static_cast<Index>(window_size_), channels = input_size_ + output_size_;
   if (case_one_) {
-    model_->Encode(*parameters_, Eigen::Map<const VectorXd>(state_.window.data(), size), &state_.mean, scratch);
+    model_->Encode(*parameters_, Eigen::Map<const VectorXd>(state_.window.data(), size), &latent_, scratch);
+    state_.mean.head(model_size_) = latent_;
     return;
   }
   const Eigen::Map<const MatrixXd> window(state_.window.data(), channels, size / channels);
@@ -369,8 +381,8 @@ void Ekf::Describe(const VectorXd& mean, const MatrixXd& factor, const VectorXd&
     estimate->mean = h_.cwiseProduct(scaling.scale) + scaling.mean;
     root.noalias() = H_.lazyProduct(factor);
   } else {
-    estimate->mean = mean.cwiseProduct(scaling.scale) + scaling.mean;
-    root = factor;
+    estimate->mean = mean.head(model_size_).cwiseProduct(scaling.scale) + scaling.mean;
+    root = factor.topRows(model_size_);
   }
   if (set_ && projection_ != Projection::kNone && estimate->mean.allFinite() && !physics::Contains(*set_, estimate->mean)) {
     estimate->mean = physics::Inside(*set_, estimate->mean);  // rounding has put it outside

@@ -50,7 +50,7 @@ struct FilterOptions {
 
 /// What a filter knows between two samples: all that a checkpoint must hold. Normalised units.
 struct FilterState {
-  Eigen::VectorXd mean;            ///< x⁺ after the last sample; Case II before the first: x⁻
+  Eigen::VectorXd mean;            ///< x⁺ after the last sample; Case II before the first: x⁻. With z behind it, if there is one
   Eigen::MatrixXd factor;          ///< L with P = L Lᵀ
   Eigen::VectorXd last_input;      ///< u of the last sample
   std::vector<double> window;      ///< Case I, and with initial_samples: the samples so far that the state is to be found from
@@ -82,6 +82,9 @@ struct StepTrace {
 /// passes. In Case I the state is the latent ψ; the first H fully measured samples in a row fill the encoder's window, the
 /// last of them gives the first estimate.
 ///
+/// Where the parameters come with directions in which they are not known (FilterModel), z joins the state: from N(0, I) on, constant, so
+/// that few context samples mean wider bounds, and what is measured tells of the parameters, too. Estimates are of x alone.
+///
 /// Components of y beyond the gate are left out (Outliers). A filter that is overconfident anyway, by NisMonitor, opens its gate
 /// in the same measure, and after GateOptions::recover_after samples with outliers in a row it is widened until it believes
 /// them: no measurement is locked out for good.
@@ -89,7 +92,7 @@ struct StepTrace {
 /// Source: paper.tex eqs. deep_cekf_all, jac_defs; the square-root form is ours.
 class Ekf {
  public:
-  /// @param model  shared with other filters. @param parameters  from model->Prepare(bundle.parameters).
+  /// @param model  shared with other filters. @param parameters  from model->Prepare.
   /// Errors: InvalidArgument naming the covariance or mean that has the wrong size or is not a covariance.
   static absl::StatusOr<Ekf> Create(const nssm::Bundle& bundle, std::shared_ptr<const FilterModel> model,
                                     std::shared_ptr<const FilterModel::Parameters> parameters,
@@ -125,7 +128,7 @@ class Ekf {
   /// @param inputs  n_u × horizon, finite. @return one estimate per column. Errors as those of Step.
   absl::StatusOr<std::vector<Estimate>> Forecast(const Eigen::MatrixXd& inputs, FilterModel::Scratch* scratch) const;
 
-  int32_t estimate_size() const { return case_one_ ? output_size_ : state_size_; }
+  int32_t estimate_size() const { return case_one_ ? output_size_ : model_size_; }
   const Eigen::MatrixXd& process_factor() const { return process_factor_; }
   bool projects() const { return projection_ != Projection::kNone; }
   /// The set of the state in normalised units; null without one.
@@ -156,7 +159,8 @@ class Ekf {
   std::shared_ptr<const FilterModel::Parameters> parameters_;
   bool case_one_ = false;
   bool next_input_ = false;  // f takes the input of the sample it leads to
-  int32_t input_size_ = 0, output_size_ = 0, state_size_ = 0;
+  int32_t input_size_ = 0, output_size_ = 0;
+  int32_t model_size_ = 0, state_size_ = 0;  // n of the model, and with z
   size_t window_size_ = 0;  // values in a full window
   data::Normaliser normaliser_;
   std::optional<physics::Polyhedron> set_;             // of what is estimated, in physical units
@@ -173,7 +177,7 @@ class Ekf {
   FilterState state_;
   StepTrace* trace_ = nullptr;
   // Scratch of a step, sized once.
-  Eigen::VectorXd u_, y_, value_, h_, whitened_;
+  Eigen::VectorXd u_, y_, value_, latent_, h_, whitened_;
   std::vector<Eigen::Index> measured_;  // components of y, those that are
   Eigen::Index updated_ = 0;            // components in the last UpdateFactor
   Eigen::MatrixXd F_, H_, H_rows_, time_work_, update_work_, product_, prior_factor_;

@@ -1,7 +1,10 @@
 #include "core/filter/filter_model.h"
 
+#include <algorithm>
+
 #include "core/autodiff/differentiate.h"
 #include "core/autodiff/evaluate.h"
+#include "core/filter/unknown_directions.h"
 #include "core/nssm/start_fit.h"
 
 namespace metaekf::filter {
@@ -16,10 +19,12 @@ using autodiff::Value;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-enum Slot : int32_t { kParameters, kState, kInput, kValueOut, kJacobianOut };
+enum Slot : int32_t { kParameters, kState, kInput, kDirection, kValueOut, kJacobianOut };
 
+/// A function of state and input: its value with the Jacobian by the state, and its derivative along one direction of the parameters.
 struct Programs {
   autodiff::Program transition, measurement, reconstruction, encode;
+  autodiff::Program transition_along, measurement_along, reconstruction_along;
 };
 
 /// value(x, u) and its derivative along every component of x at once.
@@ -34,28 +39,36 @@ autodiff::Program WithJacobian(Graph* graph, Value value, Value state) {
 
 Programs BuildPrograms(const nssm::Model& model, int32_t n) {
   const nssm::ModelSpec& spec = model.spec();
-  const auto with_graph = [&](auto build) {
-    Graph graph;
-    const nssm::ModelGraph parts(&model, &graph, nn::BindParameters(model.layout(), kParameters, &graph));
-    const Value state = graph.Input(kState, 0, n, 1);
-    const Value input = spec.input_size > 0 ? graph.Input(kInput, 0, spec.input_size, 1) : kNoValue;
-    return build(&graph, parts, state, input);
+  const auto build = [&](const auto& function, autodiff::Program* with_jacobian, autodiff::Program* along) {
+    for (const bool by_parameters : {false, true}) {
+      Graph graph;
+      const nn::ParameterValues parameters = nn::BindParameters(model.layout(), kParameters, &graph);
+      const nssm::ModelGraph parts(&model, &graph, parameters);
+      const Value state = graph.Input(kState, 0, n, 1);
+      const Value value = function(parts, state, spec.input_size > 0 ? graph.Input(kInput, 0, spec.input_size, 1) : kNoValue);
+      if (!by_parameters) {
+        *with_jacobian = WithJacobian(&graph, value, state);
+        continue;
+      }
+      const nn::ParameterValues direction = nn::BindParameters(model.layout(), kDirection, &graph);
+      std::vector<autodiff::Seed> seeds;
+      for (size_t i = 0; i < parameters.size(); ++i) seeds.push_back({parameters[i], direction[i]});
+      Value tangent = autodiff::Jvp(&graph, seeds, {value})[0];
+      if (tangent == kNoValue) tangent = graph.Constant(0, graph.node(value).rows, 1);
+      *along = autodiff::Compile(graph, {{tangent, kValueOut}});
+    }
   };
+  using Parts = nssm::ModelGraph;
   Programs programs;
-  programs.transition = with_graph([&](Graph* graph, const nssm::ModelGraph& parts, Value state, Value input) {
-    const Value next = spec.is_case_one() ? parts.Advance(state, input)
-                                          : parts.State(parts.Advance(parts.Encode(state, input), input));
-    return WithJacobian(graph, next, state);
-  });
-  programs.measurement = with_graph([&](Graph* graph, const nssm::ModelGraph& parts, Value state, Value input) {
-    const Value output = spec.is_case_one() ? parts.Output(state, kNoValue)
-                                            : parts.Output(parts.Encode(state, input), state);
-    return WithJacobian(graph, output, state);
-  });
+  build([&](const Parts& parts, Value state, Value input) {
+    return spec.is_case_one() ? parts.Advance(state, input) : parts.State(parts.Advance(parts.Encode(state, input), input));
+  }, &programs.transition, &programs.transition_along);
+  build([&](const Parts& parts, Value state, Value input) {
+    return spec.is_case_one() ? parts.Output(state, kNoValue) : parts.Output(parts.Encode(state, input), state);
+  }, &programs.measurement, &programs.measurement_along);
   if (!spec.is_case_one()) {
-    programs.reconstruction = with_graph([&](Graph* graph, const nssm::ModelGraph& parts, Value state, Value input) {
-      return WithJacobian(graph, parts.State(parts.Encode(state, input)), state);
-    });
+    build([&](const Parts& parts, Value state, Value input) { return parts.State(parts.Encode(state, input)); },
+          &programs.reconstruction, &programs.reconstruction_along);
   }
   if (spec.is_case_one() && !spec.fits_start()) {
     Graph graph;
@@ -75,6 +88,9 @@ class TypedFilterModel : public FilterModel {
         measurement_(std::move(programs.measurement)),
         reconstruction_(std::move(programs.reconstruction)),
         encode_(std::move(programs.encode)),
+        transition_along_(std::move(programs.transition_along)),
+        measurement_along_(std::move(programs.measurement_along)),
+        reconstruction_along_(std::move(programs.reconstruction_along)),
         argument_size_(std::max<int64_t>(state_size, model_.start_size())),
         input_size_(model_.spec().input_size),
         value_size_(std::max(state_size, model_.spec().output_size)) {
@@ -82,8 +98,8 @@ class TypedFilterModel : public FilterModel {
     if (model_.spec().fits_start()) prior_ = bundle.prior;
   }
 
-  std::unique_ptr<Parameters> Prepare(const std::vector<double>& parameters) const override {
-    auto typed = std::make_unique<TypedParameters>();
+  std::unique_ptr<Parameters> Prepare(const std::vector<double>& parameters, const MatrixXd& directions) const override {
+    auto typed = std::make_unique<TypedParameters>(directions);
     typed->values.assign(parameters.begin(), parameters.end());
     if (prior_) typed->exact = parameters;
     return typed;
@@ -93,21 +109,23 @@ class TypedFilterModel : public FilterModel {
 
   void Transition(const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u, VectorXd* f, MatrixXd* F,
                   Scratch* scratch) const override {
-    Run(transition_, parameters, x, u, f, F, scratch);
+    Run(transition_, transition_along_, state_size_, parameters, x, u, f, F, scratch);
+    KeepDirections(x, f, F);
   }
 
   void Measurement(const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u, VectorXd* h, MatrixXd* H,
                    Scratch* scratch) const override {
-    Run(measurement_, parameters, x, u, h, H, scratch);
+    Run(measurement_, measurement_along_, model_.spec().output_size, parameters, x, u, h, H, scratch);
   }
 
   void Reconstruct(const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u,
                    VectorXd* reconstruction, MatrixXd* J, Scratch* scratch) const override {
-    Run(reconstruction_, parameters, x, u, reconstruction, J, scratch);
+    Run(reconstruction_, reconstruction_along_, state_size_, parameters, x, u, reconstruction, J, scratch);
+    KeepDirections(x, reconstruction, J);
   }
 
   void Encode(const Parameters& parameters, const Eigen::Ref<const VectorXd>& window, VectorXd* latent, Scratch* scratch) const override {
-    if (!prior_) return Run(encode_, parameters, window, VectorXd(), latent, nullptr, scratch);
+    if (!prior_) return Run(encode_, encode_, latent->size(), parameters, window, VectorXd(), latent, nullptr, scratch);
     TypedScratch& s = static_cast<TypedScratch&>(*scratch);
     s.window = window;
     *latent = s.start_fit->Fit(static_cast<const TypedParameters&>(parameters).exact.data(), s.window).col(0);
@@ -119,12 +137,16 @@ class TypedFilterModel : public FilterModel {
 
  private:
   struct TypedParameters : Parameters {
+    explicit TypedParameters(const MatrixXd& unknown) : along(unknown.template cast<T>()) { directions_ = unknown.cols(); }
     std::vector<T> values;
+    Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic> along;  // V
     std::vector<double> exact;  // for StartFit
   };
   struct TypedScratch : Scratch {
     explicit TypedScratch(const TypedFilterModel& owner)
-        : arena({&owner.transition_, &owner.measurement_, &owner.reconstruction_, &owner.encode_}),
+        : arena({&owner.transition_, &owner.measurement_, &owner.reconstruction_, &owner.encode_, &owner.transition_along_,
+                 &owner.measurement_along_, &owner.reconstruction_along_}),
+          parameters(owner.model_.layout().size()),
           state(static_cast<size_t>(owner.argument_size_)),
           input(static_cast<size_t>(owner.input_size_)),
           value(static_cast<size_t>(owner.value_size_)),
@@ -134,38 +156,66 @@ class TypedFilterModel : public FilterModel {
       window.resize(owner.model_.start_size(), 1);
     }
     Arena<T> arena;
+    Eigen::Matrix<T, Eigen::Dynamic, 1> parameters;  // ω̂ + V z
     std::vector<T> state, input, value, jacobian;
     std::optional<nssm::StartFit> start_fit;
     MatrixXd window;
   };
 
-  static void Run(const Executable<T>& executable, const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u,
-                  VectorXd* value, MatrixXd* jacobian, Scratch* scratch) {
+  /// Value and Jacobian, the latter by z too where the state comes with it. @param rows  of the program's results: the first of these.
+  void Run(const Executable<T>& executable, const Executable<T>& along, Eigen::Index rows, const Parameters& parameters, const Eigen::Ref<const VectorXd>& x,
+           const Eigen::Ref<const VectorXd>& u, VectorXd* value, MatrixXd* jacobian, Scratch* scratch) const {
     TypedScratch& s = static_cast<TypedScratch&>(*scratch);
-    for (Eigen::Index i = 0; i < x.size(); ++i) s.state[static_cast<size_t>(i)] = static_cast<T>(x[i]);
+    const TypedParameters& typed = static_cast<const TypedParameters&>(parameters);
+    const Eigen::Index n = state_size_, r = jacobian == nullptr ? 0 : x.size() - n;
+    for (Eigen::Index i = 0; i < x.size() - r; ++i) s.state[static_cast<size_t>(i)] = static_cast<T>(x[i]);
     for (Eigen::Index i = 0; i < u.size(); ++i) s.input[static_cast<size_t>(i)] = static_cast<T>(u[i]);
+    const T* omega = typed.values.data();
+    if (r > 0) {
+      s.parameters = Eigen::Map<const Eigen::Matrix<T, Eigen::Dynamic, 1>>(omega, s.parameters.size());
+      for (Eigen::Index k = 0; k < r; ++k) s.parameters += static_cast<T>(x[n + k]) * typed.along.col(k);
+      omega = s.parameters.data();
+    }
     Slots<T> slots;
-    slots.Input(kParameters, static_cast<const TypedParameters&>(parameters).values.data())
+    slots.Input(kParameters, omega)
         .Input(kState, s.state.data())
         .Input(kInput, s.input.data())
         .Output(kValueOut, s.value.data())
         .Output(kJacobianOut, s.jacobian.data());
     autodiff::Evaluate(executable, slots, s.arena);
-    for (Eigen::Index i = 0; i < value->size(); ++i) (*value)[i] = static_cast<double>(s.value[static_cast<size_t>(i)]);
+    for (Eigen::Index i = 0; i < rows; ++i) (*value)[i] = static_cast<double>(s.value[static_cast<size_t>(i)]);
     if (jacobian == nullptr) return;
-    for (Eigen::Index i = 0; i < jacobian->size(); ++i) {
-      jacobian->data()[i] = static_cast<double>(s.jacobian[static_cast<size_t>(i)]);
+    for (Eigen::Index k = 0; k < n; ++k) {
+      for (Eigen::Index i = 0; i < rows; ++i) (*jacobian)(i, k) = static_cast<double>(s.jacobian[static_cast<size_t>(k * rows + i)]);
     }
+    for (Eigen::Index k = 0; k < r; ++k) {
+      slots.Input(kDirection, typed.along.col(k).data());
+      autodiff::Evaluate(along, slots, s.arena);
+      for (Eigen::Index i = 0; i < rows; ++i) (*jacobian)(i, n + k) = static_cast<double>(s.value[static_cast<size_t>(i)]);
+    }
+  }
+
+  /// z stays as it is.
+  void KeepDirections(const Eigen::Ref<const VectorXd>& x, VectorXd* value, MatrixXd* jacobian) const {
+    const Eigen::Index r = x.size() - state_size_;
+    if (r == 0) return;
+    value->tail(r) = x.tail(r);
+    jacobian->bottomRows(r).setZero();
+    jacobian->bottomRightCorner(r, r).setIdentity();
   }
 
   const nssm::Model model_;
   std::optional<nssm::GaussianPrior> prior_;
-  Executable<T> transition_, measurement_, reconstruction_, encode_;
+  Executable<T> transition_, measurement_, reconstruction_, encode_, transition_along_, measurement_along_, reconstruction_along_;
   int64_t argument_size_;
   int32_t input_size_, value_size_;
 };
 
 }  // namespace
+
+std::unique_ptr<FilterModel::Parameters> FilterModel::Prepare(const nssm::Bundle& bundle) const {
+  return Prepare(bundle.parameters, UnknownDirections(bundle));
+}
 
 std::unique_ptr<FilterModel> FilterModel::Create(const nssm::Bundle& bundle) {
   const nssm::Model& model = bundle.model;

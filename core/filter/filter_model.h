@@ -13,6 +13,9 @@ namespace metaekf::filter {
 ///   Case II   f(x, u) = 𝓟x𝓓x𝓐𝓔(x, u)    h(x, u) = 𝓟y𝓓y𝓔(x, u)      state x
 ///   Case I    f(ψ, u) = 𝓐(ψ, u)          h(ψ) = 𝓟𝓓y(ψ)              state ψ, started by 𝓔(window)
 ///
+/// Where parameters come with directions V in which they are not known, ω = ω̂ + V z, the state may be joined by z, which
+/// stays as it is: f([x; z], u) = [f(x, u; ω̂ + V z); z], and so on. A state without z has the parameters ω̂.
+///
 /// Compiled once per architecture; parameters are arguments, so one FilterModel serves every adaptation of a
 /// model. Immutable and safe to share; each thread brings a Scratch. No function allocates.
 /// Source: paper.tex eqs. deep_cekf_all, jac_defs, vcc_model_for_ekf.
@@ -22,6 +25,11 @@ class FilterModel {
   class Parameters {
    public:
     virtual ~Parameters() = default;
+    /// r, columns of V.
+    Eigen::Index directions() const { return directions_; }
+
+   protected:
+    Eigen::Index directions_ = 0;
   };
   /// Memory that one thread works in.
   class Scratch {
@@ -33,10 +41,14 @@ class FilterModel {
   static std::unique_ptr<FilterModel> Create(const nssm::Bundle& bundle);
   virtual ~FilterModel() = default;
 
-  virtual std::unique_ptr<Parameters> Prepare(const std::vector<double>& parameters) const = 0;
+  /// @param directions  V, n_ω × r.
+  virtual std::unique_ptr<Parameters> Prepare(const std::vector<double>& parameters, const Eigen::MatrixXd& directions) const = 0;
+  std::unique_ptr<Parameters> Prepare(const std::vector<double>& parameters) const { return Prepare(parameters, Eigen::MatrixXd()); }
+  /// The bundle's parameters and what its posterior leaves open of them (UnknownDirections).
+  std::unique_ptr<Parameters> Prepare(const nssm::Bundle& bundle) const;
   virtual std::unique_ptr<Scratch> MakeScratch() const = 0;
 
-  /// f and F = ∂f/∂x at (x, u). @param F  n × n.
+  /// f and F = ∂f/∂x at (x, u). @param x  n, or n + r with z behind it; the results are as large. @param F  n × n.
   virtual void Transition(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
                           Eigen::VectorXd* f, Eigen::MatrixXd* F, Scratch* scratch) const = 0;
   /// h and H = ∂h/∂x at (x, u). @param H  n_y × n.

@@ -203,6 +203,7 @@ absl::StatusOr<FitResult> FitByLevenbergMarquardt(const Bundle& bundle, const Pr
   if (stopped) return absl::CancelledError("the adaptation was cancelled");
   FitResult result{.parameters = std::move(fit.parameters), .unknowns = fit.fit.unknowns};
   METAEKF_ASSIGN_OR_RETURN(result.posterior, PosteriorOf(fit.fit, prior.start.rows()));
+  result.posterior->mask = problem.mask;
   nssm::RoundToPrecision(bundle.model.spec().precision, &result.parameters);
   nssm::RolloutLeastSquares::Workspace workspace(plan.dynamics, data.shape);
   const Eigen::VectorXd weights = prior.noise_variance.cwiseInverse();

@@ -310,10 +310,12 @@ std::string WriteAdaptedSubset(const Bundle& bundle, const nn::Mask& mask) {
 
 namespace {
 
-/// ω₀ + V z into the adapted tensors. Errors: InvalidArgument if the base has no such directions.
-absl::Status MoveAlongLoadings(const Safetensors& file, const Safetensors::Tensor& coordinates, Bundle* bundle) {
+/// ω₀ + V z into the adapted tensors. @param mask  receives which these are.
+/// Errors: InvalidArgument if the base has no such directions.
+absl::Status MoveAlongLoadings(const Safetensors& file, const Safetensors::Tensor& coordinates, Bundle* bundle, nn::Mask* adapted_mask) {
   const auto adapted = file.metadata.find(kAdaptedKey);
-  METAEKF_ASSIGN_OR_RETURN(const nn::Mask mask, nn::ParseMask(adapted == file.metadata.end() ? "*" : adapted->second, bundle->model.layout()));
+  METAEKF_ASSIGN_OR_RETURN(*adapted_mask, nn::ParseMask(adapted == file.metadata.end() ? "*" : adapted->second, bundle->model.layout()));
+  const nn::Mask& mask = *adapted_mask;
   std::vector<size_t> places;  // of the adapted parameters in ω
   for (size_t i = 0; i < mask.size(); ++i) {
     const nn::Tensor& tensor = bundle->model.layout().tensors()[i];
@@ -352,11 +354,12 @@ absl::Status ApplyAdaptedSubset(const std::string& bytes, Bundle* bundle) {
     adapted += static_cast<int64_t>(tensor.values.size());
   }
   if (coordinates != nullptr) {
-    METAEKF_RETURN_IF_ERROR(MoveAlongLoadings(file, *coordinates, bundle));
+    METAEKF_RETURN_IF_ERROR(MoveAlongLoadings(file, *coordinates, bundle, &seen));
     adapted = static_cast<int64_t>(coordinates->values.size());
   }
   if (posterior == nullptr) return absl::OkStatus();
   METAEKF_ASSIGN_OR_RETURN(bundle->posterior, ReadPosterior(*posterior, adapted));
+  bundle->posterior->mask = seen;
   if (coordinates != nullptr) {
     bundle->posterior->coordinates = Eigen::Map<const Eigen::VectorXd>(coordinates->values.data(), static_cast<Eigen::Index>(coordinates->values.size()));
   }

@@ -2,6 +2,8 @@
 
 #include <Eigen/Core>
 
+#include "core/nn/parameters.h"
+
 namespace metaekf::nssm {
 
 /// What a fleet says of a system of which nothing is known yet: ω ~ N(ω₀, Λ⁻¹) with ω₀ the model's own parameters.
@@ -25,6 +27,7 @@ struct GaussianPosterior {
   Eigen::MatrixXd information;  ///< symmetric, positive definite
   /// Under a prior with loadings: z, which the information is of then; ω is AlongLoadings. Else empty.
   Eigen::VectorXd coordinates;
+  nn::Mask mask;  ///< tensors that ω is of
 };
 
 /// ω₀ + V z, of the adapted parameters.

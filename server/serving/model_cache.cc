@@ -113,7 +113,7 @@ ModelCache::Loaded ModelCache::Serve(nssm::Bundle bundle, const std::string& ver
                                      const std::string& adaptation) {
   auto model = std::make_shared<ServedModel>(ServedModel{.bundle = std::move(bundle)});
   model->filter_model = FilterModelOf(model->bundle, version);
-  model->filter_parameters = model->filter_model->Prepare(model->bundle.parameters);
+  model->filter_parameters = model->filter_model->Prepare(model->bundle);
   model->model_version = version;
   model->adaptation = adaptation;
   return model;
