@@ -2,12 +2,15 @@
 
 #include <algorithm>
 #include <cmath>
+#include <optional>
 #include <thread>
+#include <utility>
 
 #include "absl/strings/str_cat.h"
 #include "absl/strings/str_join.h"
 #include "client/cli/commands.h"
 #include "client/cli/data_files.h"
+#include "client/cli/progress.h"
 #include "core/base/executor.h"
 #include "core/base/numbers.h"
 #include "core/base/status.h"
@@ -126,7 +129,12 @@ absl::Status WriteParameters(const sim::Fleet& fleet, const std::string& path) {
 absl::Status Simulate(const Flags& flags, Console& console) {
   METAEKF_ASSIGN_OR_RETURN(const sim::Request request, ToRequest(flags));
   const auto executor = base::MakeThreadExecutor(std::max(1U, std::thread::hardware_concurrency()));
-  METAEKF_ASSIGN_OR_RETURN(const sim::Fleet fleet, sim::Simulate(request, *executor));
+  std::optional<Progress> progress(std::in_place, console, "simulate");
+  METAEKF_ASSIGN_OR_RETURN(const sim::Fleet fleet, sim::Simulate(request, *executor, [&](int64_t done) {
+    progress->Update(static_cast<uint64_t>(done), static_cast<uint64_t>(request.systems), std::nullopt, "systems");
+    return true;
+  }));
+  progress.reset();
   METAEKF_RETURN_IF_ERROR(data::WriteCsvFile(fleet.dataset, flags.out));
   if (!flags.parameters_out.empty()) {
     METAEKF_RETURN_IF_ERROR(WriteParameters(fleet, flags.parameters_out));

@@ -239,9 +239,8 @@ absl::StatusOr<Picture> DrawTargets(const std::vector<Result>& results) {
 }
 
 absl::StatusOr<Result> Judge(const Subject& subject, base::Executor* executor, const OnProgress& on_progress) {
-  if (on_progress && !on_progress(0, 1, absl::StrCat("simulating ", subject.name))) return absl::CancelledError("the study was cancelled");
-  METAEKF_ASSIGN_OR_RETURN(const sim::Fleet fleet, sim::Simulate(subject.fleet, *executor));
-  METAEKF_ASSIGN_OR_RETURN(const sim::Fleet targets, sim::Simulate(subject.targets, *executor));
+  METAEKF_ASSIGN_OR_RETURN(const sim::Fleet fleet, SimulateFleet(subject.fleet, executor, absl::StrCat("simulating the fleet of ", subject.name), on_progress));
+  METAEKF_ASSIGN_OR_RETURN(const sim::Fleet targets, SimulateFleet(subject.targets, executor, absl::StrCat("simulating targets of ", subject.name), on_progress));
   METAEKF_ASSIGN_OR_RETURN(std::vector<Training> trainings, TrainAll({subject.learner}, fleet.dataset, {}, kFirstSeed, executor, on_progress));
   Result result{subject, std::move(trainings.front()), std::vector<Trial>(targets.dataset.trajectories.size())};
   if (!result.training.bundle.ok()) return result;

@@ -39,7 +39,9 @@ absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const st
     functions->Transition(*parameters, units.states.Normalise(recording.states.col(from - 1)),
                           units.inputs.Normalise(recording.inputs.col(from - 1)), &first, &F, scratch.get());
     options.initial_mean = first.cwiseProduct(units.states.scale) + units.states.mean;
-    options.initial_cov = options.process_cov.value_or(model.noise.process);
+    const MatrixXd& W = model.noise.process_bias.loadings;
+    options.initial_cov = options.process_cov ? *options.process_cov : MatrixXd(model.noise.process);
+    if (!options.process_cov && W.cols() > 0) *options.initial_cov += W * W.transpose();
   }
   METAEKF_ASSIGN_OR_RETURN(filter::Ekf ekf, filter::Ekf::Create(model, functions, parameters, options));
   filter::Estimate estimate = ekf.MakeEstimate();

@@ -59,4 +59,10 @@ absl::Status RunJobs(size_t count, base::Executor* executor, const std::string& 
   return cancelled ? absl::CancelledError("the study was cancelled") : absl::OkStatus();
 }
 
+absl::StatusOr<sim::Fleet> SimulateFleet(const sim::Request& request, base::Executor* executor, const std::string& what, const OnProgress& on_progress) {
+  return sim::Simulate(request, *executor, [&](int64_t done) {
+    return !on_progress || on_progress(static_cast<size_t>(done), static_cast<size_t>(request.systems), what);
+  });
+}
+
 }  // namespace metaekf::experiments

@@ -5,6 +5,7 @@
 
 #include "absl/status/status.h"
 #include "core/experiments/experiment.h"
+#include "core/sim/simulate.h"
 
 namespace metaekf::experiments {
 
@@ -28,5 +29,8 @@ class PeakMemory {
 /// by then are left out.
 absl::Status RunJobs(size_t count, base::Executor* executor, const std::string& what, const OnProgress& on_progress,
                      const std::function<absl::Status(size_t index)>& job);
+
+/// sim::Simulate that tells how far it is. Errors: those, and Cancelled if on_progress said so.
+absl::StatusOr<sim::Fleet> SimulateFleet(const sim::Request& request, base::Executor* executor, const std::string& what, const OnProgress& on_progress);
 
 }  // namespace metaekf::experiments

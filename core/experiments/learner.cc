@@ -107,7 +107,7 @@ absl::StatusOr<SystemModel> AdaptToContext(const nssm::Bundle& bundle, const Tra
   nssm::Bundle adapted = bundle;
   // Levenberg–Marquardt without a step still chooses the most probable of the fleet's fits.
   if (options.inner_loop.steps > 0 || options.method == meta::AdaptationMethod::kLevenbergMarquardt) {
-    METAEKF_ASSIGN_OR_RETURN(adapted.parameters, meta::AdaptedParameters(bundle, context, options));
+    METAEKF_ASSIGN_OR_RETURN(adapted, meta::AdaptedBundle(bundle, context, options));
   }
   return ModelOf(adapted);
 }

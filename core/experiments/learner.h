@@ -61,7 +61,7 @@ SystemModel ModelOf(const nssm::Bundle& bundle);
 /// Whether a model has diverged, in training or adaptation: its run has failed, and no more. Other errors end a study.
 bool IsDivergence(const absl::Status& status);
 
-/// Adapts as the specification that the model was trained with says. Errors: those of meta::AdaptedParameters.
+/// Adapts as the specification that the model was trained with says. Errors: those of meta::AdaptedBundle.
 absl::StatusOr<SystemModel> AdaptToContext(const nssm::Bundle& bundle, const data::Trajectory& context);
 
 /// Predictions of the samples `from` … T − 1, n × (T − from).

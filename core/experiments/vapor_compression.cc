@@ -226,9 +226,9 @@ absl::StatusOr<Picture> DrawErrors(const Study& study) {
     const std::string& label = study.learners[i].label;
     picture.boxes.push_back({.label = label, .values = study.Errors(i, study.Way(i))});
     if (label == kVaporPrior) {
-      picture.boxes.push_back({.label = "unadapted", .values = study.Values(i, [](const Trial& trial) { return trial.unadapted; })});
-      picture.boxes.push_back({.label = "by autoencoder", .values = study.Errors(i, kAutoencoder)});
-      picture.boxes.push_back({.label = "not projected", .values = study.Errors(i, kNotProjected)});
+      picture.boxes.push_back({.label = absl::StrCat(label, ", unadapted"), .values = study.Values(i, [](const Trial& trial) { return trial.unadapted; })});
+      picture.boxes.push_back({.label = absl::StrCat(label, ", by autoencoder"), .values = study.Errors(i, kAutoencoder)});
+      picture.boxes.push_back({.label = absl::StrCat(label, ", not projected"), .values = study.Errors(i, kNotProjected)});
     }
   }
   METAEKF_ASSIGN_OR_RETURN(std::string svg, plot::RenderSvg(picture));
@@ -319,9 +319,9 @@ absl::Status RunSeed(uint64_t seed, base::Executor* executor, const OnProgress& 
     return sim::Request{.system = "vapor-compression", .systems = systems, .seed = of, .steps = samples, .settings = VaporCompressionSettings()};
   };
   const Scale& scale = study->scale;
-  if (on_progress && !on_progress(0, 1, "simulating the fleet")) return absl::CancelledError("the study was cancelled");
-  METAEKF_ASSIGN_OR_RETURN(const sim::Fleet fleet, sim::Simulate(request(scale.sources, seed, scale.fleet_samples), *executor));
-  METAEKF_ASSIGN_OR_RETURN(sim::Fleet target_fleet, sim::Simulate(request(scale.targets, seed + kTargetSeeds, scale.samples), *executor));
+  METAEKF_ASSIGN_OR_RETURN(const sim::Fleet fleet, SimulateFleet(request(scale.sources, seed, scale.fleet_samples), executor, "simulating the fleet", on_progress));
+  METAEKF_ASSIGN_OR_RETURN(sim::Fleet target_fleet,
+                           SimulateFleet(request(scale.targets, seed + kTargetSeeds, scale.samples), executor, "simulating targets", on_progress));
   if (seed == kFirstSeed) study->deviations = DeviationsOf(fleet.dataset);
   const std::vector<Learner> untold(study->learners.begin(), study->learners.end() - 1);
   METAEKF_ASSIGN_OR_RETURN(std::vector<Training> trainings, TrainAll(untold, fleet.dataset, {}, seed, executor, on_progress));

@@ -2,14 +2,17 @@
 
 #include <Eigen/Cholesky>
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <functional>
 #include <limits>
 #include <memory>
 #include <numbers>
+#include <utility>
 
 #include "core/base/status.h"
 #include "core/filter/ekf.h"
+#include "core/filter/unknown_directions.h"
 
 namespace metaekf::filter {
 
@@ -19,35 +22,68 @@ using Eigen::VectorXd;
 
 namespace {
 
+constexpr double kFar = 3;               // standard deviations
 constexpr double kProbe = 0.4;           // of ln d², to see a slope and a curvature
 constexpr double kWorthwhile = 1e-3;     // of the likelihood, per sample and entry
 constexpr int kRounds = 6;               // of a model that follows its system two or three do
 constexpr double kLargestMove = 2;       // of ln d²
 constexpr double kLeastShare = 0.2;      // of a move
 constexpr double kLargest = 30;          // |ln d²|: 10¹³
+constexpr double kLargestCorrelation = 1 - 1e-9;
 constexpr double kSearchWork = 16000;    // samples of one entry; a search over n entries takes some n^1.5 times as long
 constexpr Index kFewestSamples = 50;
 constexpr double kFailed = -std::numeric_limits<double>::infinity();
 
-/// Where a scale acts.
+/// Where a scale acts: D_q, D_r, then of each bias its size and its time constant, then the deviation of the parameters.
 struct Layout {
   Index process = 0;      ///< entries of D_q: n, or 1 for all
   Index measurement = 0;  ///< entries of D_r
-  Index size() const { return process + measurement; }
+  bool process_bias = false, measurement_bias = false, parameters = false;
+  Index biases() const { return process + measurement; }  ///< where theirs begin
+  Index size() const { return biases() + 2 * (process_bias + measurement_bias) + parameters; }
 };
+
+/// All of Q, and all of R.
+std::array<VectorXd, 2> Together(const Layout& layout) {
+  std::array<VectorXd, 2> together = {VectorXd::Zero(layout.size()), VectorXd::Zero(layout.size())};
+  together[0].head(layout.process).setOnes();
+  together[1].segment(layout.process, layout.measurement).setOnes();
+  return together;
+}
+
+nssm::GaussMarkov Scaled(nssm::GaussMarkov bias, double log_variance, double log_time) {
+  bias.loadings *= std::exp(0.5 * log_variance);
+  bias.correlation = std::min(kLargestCorrelation, std::pow(bias.correlation, std::exp(-log_time)));
+  return bias;
+}
 
 nssm::FilterNoise Scaled(const nssm::FilterNoise& noise, const VectorXd& log_scales, const Layout& layout) {
   const Index n = noise.process.rows();
   const VectorXd d = (0.5 * log_scales).array().exp();
   const VectorXd d_q = layout.process == n ? VectorXd(d.head(n)) : VectorXd::Constant(n, d[0]);
-  const VectorXd d_r = d.tail(layout.measurement);
+  const VectorXd d_r = d.segment(layout.process, layout.measurement);
   nssm::FilterNoise scaled = noise;
   scaled.process = d_q.asDiagonal() * noise.process * d_q.asDiagonal();
   scaled.measurement = d_r.asDiagonal() * noise.measurement * d_r.asDiagonal();
+  Index at = layout.biases();
+  for (const auto& [there, bias] : {std::pair{layout.process_bias, &scaled.process_bias}, {layout.measurement_bias, &scaled.measurement_bias}}) {
+    if (!there) continue;
+    *bias = Scaled(*bias, log_scales[at], log_scales[at + 1]);
+    at += 2;
+  }
+  if (layout.parameters) scaled.parameter_std *= d[at];
   return scaled;
 }
 
-double LogDensity(double error, double variance) { return -0.5 * (error * error / variance + std::log(2 * std::numbers::pi * variance)); }
+/// Huber's ρ of a square of unit mean: what lies far outside counts in proportion to its distance, not to the square.
+double Tempered(double square) {
+  const double size = std::sqrt(square);
+  return size <= kFar ? square : kFar * (2 * size - kFar);
+}
+
+double LogDensity(double error, double variance) {
+  return -0.5 * (Tempered(error * error / variance) + std::log(2 * std::numbers::pi * variance));
+}
 
 /// ln N(ỹ; 0, S) of what was measured, in units of the outputs' scales.
 double LogLikelihood(const Estimate& estimate, const VectorXd& scale) {
@@ -58,7 +94,8 @@ double LogLikelihood(const Estimate& estimate, const VectorXd& scale) {
   const MatrixXd S = scale.cwiseInverse().asDiagonal() * estimate.innovation_cov * scale.cwiseInverse().asDiagonal();
   const Eigen::LLT<MatrixXd> cholesky(MatrixXd(S(rows, rows)));
   const double log_determinant = 2 * MatrixXd(cholesky.matrixL()).diagonal().array().log().sum();
-  return -0.5 * (estimate.nis + log_determinant + static_cast<double>(rows.size()) * std::log(2 * std::numbers::pi));
+  const double m = static_cast<double>(rows.size());
+  return -0.5 * (m * Tempered(estimate.nis / m) + log_determinant + m * std::log(2 * std::numbers::pi));
 }
 
 /// A recording, the filter's parameters for it, and where it stands before the first sample that counts, whatever Q and R.
@@ -72,8 +109,7 @@ struct Prepared {
 absl::StatusOr<Ekf> MakeFilter(const nssm::Bundle& bundle, const nssm::FilterNoise& noise,
                                const std::shared_ptr<const FilterModel>& model, const Prepared& run) {
   return Ekf::Create(bundle, model, run.parameters,
-                     {.process_cov = noise.process, .measurement_cov = noise.measurement, .initial_cov = noise.initial,
-                      .gate = {.probability = 0}, .restart_after_divergence = false});
+                     {.noise = noise, .gate = {.probability = 0}, .restart_after_divergence = false});
 }
 
 /// Case I: when the first window is full. Case II: at the first state, which was recorded; where a filter that had to guess would
@@ -83,8 +119,9 @@ absl::Status Begin(const nssm::Bundle& bundle, const std::shared_ptr<const Filte
   METAEKF_ASSIGN_OR_RETURN(Ekf ekf, MakeFilter(bundle, bundle.noise, model, *run));
   if (!bundle.model.spec().is_case_one()) {
     run->start = ekf.state();
-    run->start.mean = bundle.normaliser.states.Normalise(run->trajectory->states.col(0));
-    run->start.factor.setZero();
+    const Index n = model->state_size();
+    run->start.mean.head(n) = bundle.normaliser.states.Normalise(run->trajectory->states.col(0));
+    run->start.factor.topLeftCorner(n, n).setZero();
     run->start.last_input = bundle.normaliser.inputs.Normalise(run->trajectory->inputs.col(0));
     run->start.started = true;
     run->begin = 1;
@@ -125,12 +162,12 @@ Score ScoreOf(const nssm::Bundle& bundle, const nssm::FilterNoise& noise, const 
     for (Index i = 0; i < states; ++i) {
       const double scale = bundle.normaliser.states.scale[i], error = run.trajectory->states(i, t) - estimate.mean[i];
       sum += LogDensity(error / scale, estimate.cov(i, i) / (scale * scale));
-      squares[i] += error * error / estimate.cov(i, i);
+      squares[i] += Tempered(error * error / estimate.cov(i, i));
       counts[i] += 1;
     }
     for (Index i = 0; i < outputs; ++i) {
       if (std::isnan(estimate.innovation[i])) continue;
-      squares[states + i] += estimate.innovation[i] * estimate.innovation[i] / estimate.innovation_cov(i, i);
+      squares[states + i] += Tempered(estimate.innovation[i] * estimate.innovation[i] / estimate.innovation_cov(i, i));
       counts[states + i] += 1;
     }
     ++samples;
@@ -155,7 +192,7 @@ absl::StatusOr<std::vector<Prepared>> PrepareAll(const nssm::Bundle& bundle, con
                                                  const std::vector<CalibrationRun>& runs) {
   std::vector<Prepared> prepared;
   for (const CalibrationRun& run : runs) {
-    prepared.push_back({&run.trajectory, model->Prepare(run.parameters), {}});
+    prepared.push_back({&run.trajectory, model->Prepare(run.parameters, run.directions), {}});
     METAEKF_RETURN_IF_ERROR(Begin(bundle, model, &prepared.back()));
     prepared.back().end = run.trajectory.length();
   }
@@ -190,6 +227,10 @@ Score ScoreOfAll(const nssm::Bundle& bundle, const nssm::FilterNoise& noise, con
 
 }  // namespace
 
+CalibrationRun RunOf(const nssm::Bundle& adapted, data::Trajectory trajectory) {
+  return {adapted.parameters, UnknownDirections(adapted), std::move(trajectory)};
+}
+
 double LogLikelihood(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, base::Executor* executor) {
   const std::shared_ptr<const FilterModel> model = FilterModel::Create(bundle);
   const absl::StatusOr<std::vector<Prepared>> prepared = PrepareAll(bundle, model, runs);
@@ -201,8 +242,12 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
   const std::shared_ptr<const FilterModel> model = FilterModel::Create(bundle);
   const absl::StatusOr<std::vector<Prepared>> prepared = PrepareAll(bundle, model, runs);
   if (!prepared.ok()) return bundle.noise;
+  const bool fleet = std::isinf(log_std);
   const Layout layout{.process = bundle.model.spec().is_case_one() ? 1 : bundle.noise.process.rows(),
-                      .measurement = bundle.noise.measurement.rows()};
+                      .measurement = bundle.noise.measurement.rows(),
+                      .process_bias = bundle.noise.process_bias.loadings.cols() > 0,
+                      .measurement_bias = bundle.noise.measurement_bias.loadings.cols() > 0,
+                      .parameters = fleet && std::any_of(runs.begin(), runs.end(), [](const CalibrationRun& run) { return run.directions.cols() > 0; })};
   const auto score = [&](const std::vector<Prepared>& of, const VectorXd& log_scales) {
     if (log_scales.lpNorm<Eigen::Infinity>() > kLargest) return Score();
     Score found = ScoreOfAll(bundle, Scaled(bundle.noise, log_scales, layout), model, of, executor);
@@ -214,9 +259,10 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
   // most likely yet, but near it, in few evaluations whatever their number.
   const auto match_errors = [&](const std::vector<Prepared>& of) {
     Score found = score(of, best);
-    const bool moves = found.squares.size() == layout.size();
+    const bool moves = found.squares.size() == layout.biases();
     for (double share = 1; moves && found.likelihood > kFailed && share >= kLeastShare;) {
-      const VectorXd move = found.squares.array().log().max(-kLargestMove).min(kLargestMove);
+      VectorXd move = VectorXd::Zero(layout.size());
+      move.head(layout.biases()) = found.squares.array().log().max(-kLargestMove).min(kLargestMove);
       const Score trial = score(of, best + share * move);
       if (trial.likelihood > found.likelihood + kWorthwhile * static_cast<double>(layout.size())) {
         best += share * move;
@@ -226,6 +272,19 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
       }
     }
   };
+  // A filter that has lost track tells nothing of where it would keep it: first in great steps to where all do.
+  for (double at = score(*prepared, best).likelihood, before = kFailed; fleet && at > before + kWorthwhile;) {
+    before = at;
+    for (const VectorXd& together : Together(layout)) {
+      for (const double step : {kLargestMove, -kLargestMove}) {
+        const double trial = score(*prepared, best + step * together).likelihood;
+        if (!(trial > at + kWorthwhile)) continue;
+        best += step * together;
+        at = trial;
+        break;
+      }
+    }
+  }
   match_errors(*prepared);
   const std::vector<Prepared> beginnings = FirstOf(*prepared, SearchSamples(layout));
   const auto objective = [&](const VectorXd& log_scales) { return score(beginnings, log_scales).likelihood; };
@@ -239,14 +298,11 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
       return;
     }
   };
-  VectorXd all_process = VectorXd::Zero(layout.size()), all_measurement = all_process;
-  all_process.head(layout.process).setOnes();
-  all_measurement.tail(layout.measurement).setOnes();
   double before = kFailed;
   for (int round = 0; round < kRounds && value > before + kWorthwhile * static_cast<double>(layout.size()); ++round) {
     before = value;
     // What Q and R can trade with each other is seen along these two; then every entry goes where its own parabola has its top.
-    for (const VectorXd& together : {all_process, all_measurement}) improve(TopOfParabola(objective, best, value, together) * together);
+    for (const VectorXd& together : Together(layout)) improve(TopOfParabola(objective, best, value, together) * together);
     if (layout.process == 1 && layout.measurement == 1) continue;
     VectorXd move(layout.size());
     for (Index i = 0; i < move.size(); ++i) move[i] = TopOfParabola(objective, best, value, VectorXd::Unit(move.size(), i));

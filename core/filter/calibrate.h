@@ -11,27 +11,37 @@ namespace metaekf::filter {
 /// A recording of a system, with the parameters of the model that is to follow it.
 struct CalibrationRun {
   std::vector<double> parameters;
+  Eigen::MatrixXd directions;   ///< V in which they are not known (UnknownDirections); empty: they are
   data::Trajectory trajectory;  ///< physical units; Case II with states
 };
+
+/// Of a system that `adapted` has been adapted to.
+CalibrationRun RunOf(const nssm::Bundle& adapted, data::Trajectory trajectory);
 
 /// Q and R with which filters explain recordings best.
 ///
 /// A residual's second moment is the right Q only if model errors are white. Those of an adapted model are not: they last, and a
-/// filter that takes them for white noise believes itself too much. So Q and R are scaled, Q = D_q Q₀ D_q and R = D_r R₀ D_r with
-/// diagonal D, until the innovations of the filters are most likely,
+/// filter that takes them for white noise believes itself too much. What residuals show to last is in the noise's biases; how much
+/// of it matters, and what they do not show, filters say. So all of the noise is scaled with numbers d > 0 of their own, Q = D_q Q₀ D_q
+/// and R = D_r R₀ D_r with diagonal D, of each bias W = d W₀ and τ = d² τ₀, its time constant −1/ln φ, and, of a fleet, σ = d σ₀ of the
+/// parameters, until the innovations of the filters are most likely,
 ///
-///   max over D of  mean over runs of  1/T Σ_t [ ln N(ỹ_t; 0, S_t) + Σ_i ln N(x_{t,i}; x̂_{t,i}, P_{t,ii}) ] − Σ (ln d²)²/(2 s²),
+///   max over d of  mean over runs of  1/T Σ_t [ ln N(ỹ_t; 0, S_t) + Σ_i ln N(x_{t,i}; x̂_{t,i}, P_{t,ii}) ] − Σ (ln d²)²/(2 s²),
 ///
-/// the sum over states i in Case II, where they are recorded and filters begin at the first of them. In Case I, whose latents have no
-/// axes of their own, D_q is a multiple of the identity. In Case II first all at once in proportion to the errors; then, in ln d², all of Q, all of R and
-/// every entry go to the tops of parabolas through three values each, until a round is worth less than 1e-3 an
-/// entry, six times at most. These look at the beginnings of recordings alone where there are many entries, and all move in proportion to
-/// the errors of whole recordings once more: some errors take long to grow.
+/// where beyond 3 deviations squares of errors go over into straight lines (Huber): one filter that has lost track must not be all that
+/// counts. The sum is over states i in Case II, where they are recorded and filters begin at the first of them. In Case I, whose
+/// latents have no axes of their own, D_q is a multiple of the identity. In this order:
+///
+///   1. of a fleet, all of Q and all of R move in great steps while that helps: where filters lose track, little steps lead nowhere;
+///   2. in Case II, every entry of D moves in proportion to the errors of its own;
+///   3. in ln d², all of Q, all of R and then every number go to the tops of parabolas through three values each, until a round is worth
+///      less than 1e-3 a number, six times at most, on the beginnings of recordings alone where there are many numbers;
+///   4. where these were only beginnings, 2 once more: some errors take long to grow.
 ///
 /// @param bundle  with Q₀, R₀ and P₀ in its noise. @param runs  at least one, of systems that the parameters were not fitted to, or of
 ///   samples that come after those. @param log_std  s of ln d², beside the mean over
-///   samples; infinite: as far as the recordings say.
-/// @return the noise with Q and R scaled; as it was where no filter stays finite, and for s = 0.
+///   samples; infinite: a fleet's, as far as the recordings say.
+/// @return the noise, scaled; as it was where no filter stays finite, and for s = 0.
 /// Source: maximum likelihood of innovations, e.g. R. K. Mehra, IEEE Trans. Autom. Control 15 (1970) 175; the scaling is ours.
 nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, double log_std, base::Executor* executor);
 

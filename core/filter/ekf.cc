@@ -28,6 +28,12 @@ MatrixXd Normalised(const MatrixXd& cov, const VectorXd& scale) {
   return inverse.asDiagonal() * cov * inverse.asDiagonal();
 }
 
+/// In units of scales; latents have none.
+nssm::GaussMarkov Normalised(nssm::GaussMarkov bias, const VectorXd& scale) {
+  if (scale.size() > 0 && bias.loadings.size() > 0) bias.loadings = scale.cwiseInverse().asDiagonal() * bias.loadings;
+  return bias;
+}
+
 /// A ← L with L Lᵀ = A, lower triangle; A is positive definite (checked when the filter was made).
 void CholeskyInPlace(Ref<MatrixXd> a) {
   for (Index j = 0; j < a.cols(); ++j) {
@@ -38,6 +44,17 @@ void CholeskyInPlace(Ref<MatrixXd> a) {
       a(i, j) /= a(j, j);
     }
     a.col(j).head(j).setZero();
+  }
+}
+
+/// A ← R Rᵀ; of a triangular R only the lower triangle is read.
+void Square(const Ref<const MatrixXd>& root, bool triangular, MatrixXd* a) {
+  const Index n = root.rows();
+  for (Index j = 0; j < n; ++j) {
+    auto below = a->col(j).tail(n - j);
+    below.setZero();
+    for (Index k = 0; k < (triangular ? j + 1 : root.cols()); ++k) below += root(j, k) * root.col(k).tail(n - j);
+    a->row(j).tail(n - j) = below.transpose();
   }
 }
 
@@ -66,15 +83,17 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
                                 const FilterOptions& options) {
   const nssm::ModelSpec& spec = bundle.model.spec();
   Ekf ekf;
-  ekf.model_ = std::move(model);
-  ekf.parameters_ = std::move(parameters);
+  const nssm::FilterNoise& noise = options.noise ? *options.noise : bundle.noise;
+  const data::Normaliser& units = bundle.normaliser;
+  ekf.joint_ = JointModel(std::move(model), std::move(parameters),
+                          options.process_cov ? nssm::GaussMarkov() : Normalised(noise.process_bias, spec.is_case_one() ? VectorXd() : units.states.scale),
+                          options.measurement_cov ? nssm::GaussMarkov() : Normalised(noise.measurement_bias, units.outputs.scale));
   ekf.case_one_ = spec.is_case_one();
   ekf.next_input_ = spec.transition.input_time == nssm::InputTime::kNext;
   ekf.input_size_ = spec.input_size;
   ekf.output_size_ = spec.output_size;
-  ekf.model_size_ = ekf.model_->state_size();
-  const Index r = ekf.parameters_->directions();
-  ekf.state_size_ = ekf.model_size_ + static_cast<int32_t>(r);
+  ekf.model_size_ = static_cast<int32_t>(ekf.joint_.state_size());
+  ekf.state_size_ = static_cast<int32_t>(ekf.joint_.size());
   if (options.initial_samples != 0 && (ekf.case_one_ || options.initial_samples < 0 || options.initial_samples > kMaxInitialSamples)) {
     return absl::InvalidArgumentError(
         absl::StrCat("initial samples: must be from 0 to ", kMaxInitialSamples, ", and 0 in Case I, got ", options.initial_samples));
@@ -85,14 +104,14 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
   const physics::Polyhedron* const set = ekf.case_one_ ? bundle.model.output_set() : bundle.model.state_set();
   if (set != nullptr) ekf.set_ = *set;
   if (set != nullptr && !ekf.case_one_) {
-    ekf.normalised_set_ = WithFree(InUnits(*set, bundle.normaliser.states.mean, bundle.normaliser.states.scale), r);
+    ekf.normalised_set_ = WithFree(InUnits(*set, bundle.normaliser.states.mean, bundle.normaliser.states.scale), ekf.joint_.extra_size());
   }
   const Index n = ekf.model_size_, n_y = ekf.output_size_, joint = ekf.state_size_;
   const VectorXd state_scale = ekf.case_one_ ? VectorXd::Ones(n) : bundle.normaliser.states.scale;
 
-  const MatrixXd Q = options.process_cov.value_or(bundle.noise.process);
-  const MatrixXd R = options.measurement_cov.value_or(bundle.noise.measurement);
-  const MatrixXd P = options.initial_cov.value_or(bundle.noise.initial);
+  const MatrixXd Q = options.process_cov.value_or(noise.process);
+  const MatrixXd R = options.measurement_cov.value_or(noise.measurement);
+  const MatrixXd P = options.initial_cov.value_or(noise.initial);
   METAEKF_RETURN_IF_ERROR(CheckSize("process noise covariance Q", Q, n));
   METAEKF_RETURN_IF_ERROR(CheckSize("initial covariance", P, n));
   const auto factor = [](const std::string& name, const MatrixXd& cov) -> absl::StatusOr<MatrixXd> {
@@ -100,16 +119,16 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
     if (!result.ok()) return base::Annotate(result.status(), name);
     return result;
   };
-  const auto with_z = [&](const MatrixXd& of_state, double of_z) {
+  const auto with_extra = [&](const MatrixXd& of_state, const VectorXd& of_extra) {
     MatrixXd whole = MatrixXd::Zero(joint, joint);
     whole.topLeftCorner(n, n) = of_state;
-    whole.diagonal().tail(r).setConstant(of_z);
+    whole.diagonal().tail(of_extra.size()) = of_extra;
     return whole;
   };
   METAEKF_ASSIGN_OR_RETURN(const MatrixXd process_factor, factor("process noise covariance Q", Normalised(Q, state_scale)));
   METAEKF_ASSIGN_OR_RETURN(const MatrixXd initial_factor, factor("initial covariance", Normalised(P, state_scale)));
-  ekf.process_factor_ = with_z(process_factor, 0);
-  ekf.initial_factor_ = with_z(initial_factor, 1);
+  ekf.process_factor_ = with_extra(process_factor, ekf.joint_.ExtraNoise());
+  ekf.initial_factor_ = with_extra(initial_factor, ekf.joint_.ExtraDeviations(noise.parameter_std));
   METAEKF_ASSIGN_OR_RETURN(ekf.measurement_cov_, NormalisedNoise(R, bundle.normaliser.outputs.scale));
 
   ekf.initial_mean_ = VectorXd::Zero(joint);
@@ -253,12 +272,12 @@ void Ekf::FillWindow(FilterModel::Scratch* scratch) {
 void Ekf::BeginFromWindow(FilterModel::Scratch* scratch) {
   const Index size = static_cast<Index>(window_size_), channels = input_size_ + output_size_;
   if (case_one_) {
-    model_->Encode(*parameters_, Eigen::Map<const VectorXd>(state_.window.data(), size), &latent_, scratch);
+    joint_.Encode(Eigen::Map<const VectorXd>(state_.window.data(), size), &latent_, scratch);
     state_.mean.head(model_size_) = latent_;
     return;
   }
   const Eigen::Map<const MatrixXd> window(state_.window.data(), channels, size / channels);
-  StateEstimate start = LeastSquaresStart(*model_, *parameters_,
+  StateEstimate start = LeastSquaresStart(joint_,
                                           {.inputs = window.topRows(input_size_), .outputs = window.bottomRows(output_size_),
                                            .next_input = next_input_, .prior_mean = initial_mean_, .prior_factor = initial_factor_,
                                            .process_factor = process_factor_, .measurement_cov = measurement_cov_},
@@ -268,7 +287,7 @@ void Ekf::BeginFromWindow(FilterModel::Scratch* scratch) {
 }
 
 void Ekf::TimeUpdate(FilterModel::Scratch* scratch) {
-  model_->Transition(*parameters_, state_.mean, next_input_ ? u_ : state_.last_input, &value_, &F_, scratch);
+  joint_.Transition(state_.mean, next_input_ ? u_ : state_.last_input, &value_, &F_, scratch);
   FactorTimeUpdate(F_, process_factor_, &time_work_, &state_.factor);
   state_.mean = value_;
   if (trace_ == nullptr) return;
@@ -289,7 +308,7 @@ void Ekf::MeasurementUpdate(const MatrixXd& R, FilterModel::Scratch* scratch, Es
   estimate->measured = static_cast<int>(measured_.size());
   if (measured_.empty()) return;
 
-  model_->Measurement(*parameters_, state_.mean, u_, &h_, &H_, scratch);
+  joint_.Measurement(state_.mean, u_, &h_, &H_, scratch);
   prior_factor_ = state_.factor;
   estimate->nis = UpdateFactor(measured_, R);
   WriteInnovation(estimate);
@@ -377,7 +396,7 @@ void Ekf::Describe(const VectorXd& mean, const MatrixXd& factor, const VectorXd&
   const data::ChannelScaling& scaling = case_one_ ? normaliser_.outputs : normaliser_.states;
   auto root = product_.topRows(estimate_size());
   if (case_one_) {
-    model_->Measurement(*parameters_, mean, input, &h_, &H_, scratch);
+    joint_.Measurement(mean, input, &h_, &H_, scratch);
     estimate->mean = h_.cwiseProduct(scaling.scale) + scaling.mean;
     root.noalias() = H_.lazyProduct(factor);
   } else {
@@ -388,7 +407,7 @@ void Ekf::Describe(const VectorXd& mean, const MatrixXd& factor, const VectorXd&
     estimate->mean = physics::Inside(*set_, estimate->mean);  // rounding has put it outside
   }
   for (Index i = 0; i < root.rows(); ++i) root.row(i) *= scaling.scale[i];
-  estimate->cov.noalias() = root.lazyProduct(root.transpose());
+  Square(root, /*triangular=*/!case_one_, &estimate->cov);
 }
 
 void Ekf::PutInside(FilterModel::Scratch* scratch, Estimate* estimate) {
@@ -403,7 +422,7 @@ void Ekf::PutInside(FilterModel::Scratch* scratch, Estimate* estimate) {
   estimate->slack = Slack(*normalised_set_, state_.mean);
   estimate->projection = 0;
   if (projection_ == Projection::kNone || physics::Contains(*normalised_set_, state_.mean)) return;
-  model_->Reconstruct(*parameters_, state_.mean, u_, &value_, &F_, scratch);
+  joint_.Reconstruct(state_.mean, u_, &value_, &F_, scratch);
   estimate->projection = (value_ - state_.mean).norm();
   state_.mean = value_;
   state_.factor = F_ * state_.factor;

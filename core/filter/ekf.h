@@ -9,6 +9,7 @@
 #include "core/filter/filter_model.h"
 #include "core/filter/gate.h"
 #include "core/filter/health.h"
+#include "core/filter/joint_model.h"
 
 namespace metaekf::filter {
 
@@ -36,8 +37,9 @@ enum class Projection {
 
 /// Settings of a filter that override those of the model's file. Physical units (latents in Case I).
 struct FilterOptions {
-  std::optional<Eigen::MatrixXd> process_cov;      ///< Q, n × n, positive semidefinite
-  std::optional<Eigen::MatrixXd> measurement_cov;  ///< R, n_y × n_y, positive definite
+  std::optional<nssm::FilterNoise> noise;          ///< all of it; what is given below takes precedence
+  std::optional<Eigen::MatrixXd> process_cov;      ///< Q, n × n, positive semidefinite; no error of f lasts then
+  std::optional<Eigen::MatrixXd> measurement_cov;  ///< R, n_y × n_y, positive definite; no error of h lasts then
   std::optional<Eigen::VectorXd> initial_mean;     ///< Case II: x⁻ at the first sample; default the fleet's mean
   std::optional<Eigen::MatrixXd> initial_cov;      ///< n × n, positive semidefinite
   /// Case II: the state is first found by least squares from so many samples (LeastSquaresStart); they give no estimates but the
@@ -50,7 +52,7 @@ struct FilterOptions {
 
 /// What a filter knows between two samples: all that a checkpoint must hold. Normalised units.
 struct FilterState {
-  Eigen::VectorXd mean;            ///< x⁺ after the last sample; Case II before the first: x⁻. With z behind it, if there is one
+  Eigen::VectorXd mean;            ///< x⁺ after the last sample; Case II before the first: x⁻. With what is beside it (JointModel)
   Eigen::MatrixXd factor;          ///< L with P = L Lᵀ
   Eigen::VectorXd last_input;      ///< u of the last sample
   std::vector<double> window;      ///< Case I, and with initial_samples: the samples so far that the state is to be found from
@@ -82,8 +84,9 @@ struct StepTrace {
 /// passes. In Case I the state is the latent ψ; the first H fully measured samples in a row fill the encoder's window, the
 /// last of them gives the first estimate.
 ///
-/// Where the parameters come with directions in which they are not known (FilterModel), z joins the state: from N(0, I) on, constant, so
-/// that few context samples mean wider bounds, and what is measured tells of the parameters, too. Estimates are of x alone.
+/// What is not known of the parameters, and errors of f and h that last (FilterNoise), join the state (JointModel): few context samples
+/// mean wider bounds, what is measured tells of the parameters, too, and an error that lasts is not taken for so many independent
+/// ones. Estimates are of x alone.
 ///
 /// Components of y beyond the gate are left out (Outliers). A filter that is overconfident anyway, by NisMonitor, opens its gate
 /// in the same measure, and after GateOptions::recover_after samples with outliers in a row it is widened until it believes
@@ -155,12 +158,11 @@ class Ekf {
   void JudgeHealth(Estimate* estimate);
   bool warming_up() const { return state_.window.size() < window_size_; }
 
-  std::shared_ptr<const FilterModel> model_;
-  std::shared_ptr<const FilterModel::Parameters> parameters_;
+  JointModel joint_;
   bool case_one_ = false;
   bool next_input_ = false;  // f takes the input of the sample it leads to
   int32_t input_size_ = 0, output_size_ = 0;
-  int32_t model_size_ = 0, state_size_ = 0;  // n of the model, and with z
+  int32_t model_size_ = 0, state_size_ = 0;  // of the model, and of what is followed
   size_t window_size_ = 0;  // values in a full window
   data::Normaliser normaliser_;
   std::optional<physics::Polyhedron> set_;             // of what is estimated, in physical units

@@ -110,7 +110,6 @@ class TypedFilterModel : public FilterModel {
   void Transition(const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u, VectorXd* f, MatrixXd* F,
                   Scratch* scratch) const override {
     Run(transition_, transition_along_, state_size_, parameters, x, u, f, F, scratch);
-    KeepDirections(x, f, F);
   }
 
   void Measurement(const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u, VectorXd* h, MatrixXd* H,
@@ -121,7 +120,6 @@ class TypedFilterModel : public FilterModel {
   void Reconstruct(const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u,
                    VectorXd* reconstruction, MatrixXd* J, Scratch* scratch) const override {
     Run(reconstruction_, reconstruction_along_, state_size_, parameters, x, u, reconstruction, J, scratch);
-    KeepDirections(x, reconstruction, J);
   }
 
   void Encode(const Parameters& parameters, const Eigen::Ref<const VectorXd>& window, VectorXd* latent, Scratch* scratch) const override {
@@ -193,15 +191,6 @@ class TypedFilterModel : public FilterModel {
       autodiff::Evaluate(along, slots, s.arena);
       for (Eigen::Index i = 0; i < rows; ++i) (*jacobian)(i, n + k) = static_cast<double>(s.value[static_cast<size_t>(i)]);
     }
-  }
-
-  /// z stays as it is.
-  void KeepDirections(const Eigen::Ref<const VectorXd>& x, VectorXd* value, MatrixXd* jacobian) const {
-    const Eigen::Index r = x.size() - state_size_;
-    if (r == 0) return;
-    value->tail(r) = x.tail(r);
-    jacobian->bottomRows(r).setZero();
-    jacobian->bottomRightCorner(r, r).setIdentity();
   }
 
   const nssm::Model model_;

@@ -13,8 +13,8 @@ namespace metaekf::filter {
 ///   Case II   f(x, u) = 𝓟x𝓓x𝓐𝓔(x, u)    h(x, u) = 𝓟y𝓓y𝓔(x, u)      state x
 ///   Case I    f(ψ, u) = 𝓐(ψ, u)          h(ψ) = 𝓟𝓓y(ψ)              state ψ, started by 𝓔(window)
 ///
-/// Where parameters come with directions V in which they are not known, ω = ω̂ + V z, the state may be joined by z, which
-/// stays as it is: f([x; z], u) = [f(x, u; ω̂ + V z); z], and so on. A state without z has the parameters ω̂.
+/// Where parameters come with directions V in which they are not known, ω = ω̂ + V z, the state may be joined by z: f([x; z], u) =
+/// f(x, u; ω̂ + V z), and so on, with the derivatives by z behind those by x. A state without z has the parameters ω̂.
 ///
 /// Compiled once per architecture; parameters are arguments, so one FilterModel serves every adaptation of a
 /// model. Immutable and safe to share; each thread brings a Scratch. No function allocates.
@@ -48,13 +48,14 @@ class FilterModel {
   std::unique_ptr<Parameters> Prepare(const nssm::Bundle& bundle) const;
   virtual std::unique_ptr<Scratch> MakeScratch() const = 0;
 
-  /// f and F = ∂f/∂x at (x, u). @param x  n, or n + r with z behind it; the results are as large. @param F  n × n.
+  /// f and F = ∂f/∂x at (x, u). @param x  n, or n + r with z behind it. @param f  receives n rows. @param F  receives n rows and as many
+  /// columns as x has; both may be larger.
   virtual void Transition(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
                           Eigen::VectorXd* f, Eigen::MatrixXd* F, Scratch* scratch) const = 0;
-  /// h and H = ∂h/∂x at (x, u). @param H  n_y × n.
+  /// h and H = ∂h/∂x at (x, u). @param H  receives n_y rows and as many columns as x has.
   virtual void Measurement(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
                            Eigen::VectorXd* h, Eigen::MatrixXd* H, Scratch* scratch) const = 0;
-  /// Case II: the autoencoder's x̄ = 𝓟x𝓓x𝓔(x, u) and ∂x̄/∂x. @param J  n × n.
+  /// Case II: the autoencoder's x̄ = 𝓟x𝓓x𝓔(x, u) and ∂x̄/∂x. Sizes as those of Transition.
   virtual void Reconstruct(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
                            Eigen::VectorXd* reconstruction, Eigen::MatrixXd* J, Scratch* scratch) const = 0;
   /// Case I: ψ = 𝓔(window), samples oldest first, each [u; y]; StartFit where the start is fitted.

@@ -33,8 +33,7 @@ struct Trajectory {
   MatrixXd normal;    // Σ ΦᵀHᵀR⁻¹HΦ, Φ = ∂x_t/∂x₀
 };
 
-Trajectory Run(const FilterModel& model, const FilterModel::Parameters& parameters, const LeastSquaresProblem& problem,
-               const VectorXd& x0, FilterModel::Scratch* scratch) {
+Trajectory Run(const JointModel& model, const LeastSquaresProblem& problem, const VectorXd& x0, FilterModel::Scratch* scratch) {
   const Index n = x0.size(), n_y = problem.outputs.rows(), steps = problem.outputs.cols();
   Trajectory run{.points = std::vector<Point>(static_cast<size_t>(steps)),
                  .cost = 0,
@@ -48,7 +47,7 @@ Trajectory Run(const FilterModel& model, const FilterModel::Parameters& paramete
     for (Index i = 0; i < n_y; ++i) {
       if (!std::isnan(problem.outputs(i, t))) point.rows.push_back(i);
     }
-    model.Measurement(parameters, state, problem.inputs.col(t), &point.h, &point.H, scratch);
+    model.Measurement(state, problem.inputs.col(t), &point.h, &point.H, scratch);
     if (!point.rows.empty()) {
       const VectorXd residual = (problem.outputs.col(t) - point.h)(point.rows);
       const MatrixXd J = point.H(point.rows, Eigen::all) * transfer;
@@ -60,7 +59,7 @@ Trajectory Run(const FilterModel& model, const FilterModel::Parameters& paramete
     }
     if (t + 1 == steps) break;
     VectorXd next(n);
-    model.Transition(parameters, state, problem.inputs.col(problem.next_input ? t + 1 : t), &next, &point.F, scratch);
+    model.Transition(state, problem.inputs.col(problem.next_input ? t + 1 : t), &next, &point.F, scratch);
     state = next;
     transfer = point.F * transfer;
   }
@@ -96,12 +95,11 @@ StateEstimate FilterAbout(const Trajectory& about, const LeastSquaresProblem& pr
 
 }  // namespace
 
-StateEstimate LeastSquaresStart(const FilterModel& model, const FilterModel::Parameters& parameters,
-                                const LeastSquaresProblem& problem, FilterModel::Scratch* scratch) {
+StateEstimate LeastSquaresStart(const JointModel& model, const LeastSquaresProblem& problem, FilterModel::Scratch* scratch) {
   const Index n = problem.prior_mean.size();
   const MatrixXd& L = problem.prior_factor;
   VectorXd z = VectorXd::Zero(n);
-  const auto run_from = [&](const VectorXd& at) { return Run(model, parameters, problem, problem.prior_mean + L * at, scratch); };
+  const auto run_from = [&](const VectorXd& at) { return Run(model, problem, problem.prior_mean + L * at, scratch); };
   Trajectory best = run_from(z);
   for (int iteration = 0; iteration < kIterations && std::isfinite(best.cost); ++iteration) {
     const MatrixXd information = MatrixXd::Identity(n, n) + L.transpose() * best.normal * L;

@@ -1,6 +1,6 @@
 #pragma once
 
-#include "core/filter/filter_model.h"
+#include "core/filter/joint_model.h"
 
 namespace metaekf::filter {
 
@@ -27,7 +27,6 @@ struct StateEstimate {
 /// by Gauss–Newton's method, whose steps are halved until they help. An extended Kalman filter linearises about m first, and may
 /// never come back from there if the state is far away; on a linear system both are the same.
 /// @return NaN where no trajectory stays finite.
-StateEstimate LeastSquaresStart(const FilterModel& model, const FilterModel::Parameters& parameters,
-                                const LeastSquaresProblem& problem, FilterModel::Scratch* scratch);
+StateEstimate LeastSquaresStart(const JointModel& model, const LeastSquaresProblem& problem, FilterModel::Scratch* scratch);
 
 }  // namespace metaekf::filter

@@ -18,8 +18,12 @@ constexpr Index kRowsAtATime = 32;
 }  // namespace
 
 void LowerTriangularise(Ref<MatrixXd> a) {
-  const Index rows = a.rows(), cols = a.cols();
+  const Index rows = a.rows();
   for (Index i = 0; i < rows; ++i) {
+    // Columns that have nothing in row i stay as they are; behind a time update's Q^½, whose columns begin one after the other,
+    // that is half of the work.
+    Index cols = a.cols();
+    while (cols > i + 1 && a(i, cols - 1) == 0) --cols;
     // A reflection of columns i … that maps row i's tail onto ± its norm e₁.
     double squared = 0;
     for (Index j = i + 1; j < cols; ++j) squared += a(i, j) * a(i, j);
@@ -87,7 +91,10 @@ absl::StatusOr<MatrixXd> SemidefiniteFactor(const MatrixXd& a) {
 
 void FactorTimeUpdate(const MatrixXd& F, const MatrixXd& process_factor, MatrixXd* work, MatrixXd* factor) {
   const Index n = factor->rows();
-  work->leftCols(n).noalias() = F.lazyProduct(*factor);
+  for (Index j = 0; j < n; ++j) {
+    work->col(j) = (*factor)(j, j) * F.col(j);
+    for (Index k = j + 1; k < n; ++k) work->col(j) += (*factor)(k, j) * F.col(k);
+  }
   work->rightCols(n) = process_factor;
   LowerTriangularise(*work);
   *factor = work->leftCols(n);

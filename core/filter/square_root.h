@@ -21,7 +21,7 @@ absl::StatusOr<Eigen::MatrixXd> SemidefiniteFactor(const Eigen::MatrixXd& a);
 ///   [F L⁺  Q^½] Θ = [L⁻  0]
 ///
 /// @param F  n × n. @param process_factor  Q^½, n × n. @param work  n × 2n of scratch.
-/// @param factor  L⁺ in, L⁻ out, n × n.
+/// @param factor  L⁺ in, L⁻ out, n × n, lower triangles.
 void FactorTimeUpdate(const Eigen::MatrixXd& F, const Eigen::MatrixXd& process_factor, Eigen::MatrixXd* work,
                       Eigen::MatrixXd* factor);
 
@@ -32,7 +32,7 @@ void FactorTimeUpdate(const Eigen::MatrixXd& F, const Eigen::MatrixXd& process_f
 ///
 /// @param work  (m + n) × (m + n); its upper left m × m holds R^½ and the block below and beside it is written.
 ///              On return its first m columns are [S^½; K S^½].
-/// @param H_rows  m × n. @param factor  L⁻ in, L⁺ out, n × n.
+/// @param H_rows  m × n. @param factor  L⁻ in, L⁺ out, n × n, lower triangles.
 void FactorMeasurementUpdate(const Eigen::Ref<const Eigen::MatrixXd>& H_rows, Eigen::Ref<Eigen::MatrixXd> work,
                              Eigen::MatrixXd* factor);
 

@@ -331,43 +331,41 @@ struct Trial {
   TailErrors errors;
   int32_t steps = 0;  // after which they were reached
   Eigen::VectorXd unknowns;
-  std::vector<double> parameters;
+  Bundle adapted;
 };
 
 /// Where nothing but the data holds the parameters back, the trial stops at the step that simulates the tail best, of
 /// kTailChecks that are tried.
 absl::StatusOr<Trial> RunTrial(const Bundle& bundle, const Problem& problem, const Trajectory& head, const Trajectory& tail,
                                const AdaptationOptions& options, const OnStep& on_step) {
-  Trial trial{.steps = options.inner_loop.steps};
-  Bundle adapted = bundle;
+  Trial trial{.steps = options.inner_loop.steps, .adapted = bundle};
   bool first = true;
   const int32_t period = std::max(1, options.inner_loop.steps / kTailChecks);
   const Inspect inspect = [&](int32_t step, const std::vector<double>& parameters) {
     if (step % period != 0 && step != options.inner_loop.steps) return;
-    adapted.parameters = parameters;
-    absl::StatusOr<TailErrors> errors = ErrorsOf(adapted, tail);
+    Bundle candidate = bundle;
+    candidate.parameters = parameters;
+    absl::StatusOr<TailErrors> errors = ErrorsOf(candidate, tail);
     if (!errors.ok() || (!first && !BetterInFreeRun(*errors, trial.errors))) return;
-    trial = {*std::move(errors), step, {}, parameters};
+    trial = {*std::move(errors), step, {}, std::move(candidate)};
     first = false;
   };
   const bool stops_early = options.method == AdaptationMethod::kFromScratch;
   METAEKF_ASSIGN_OR_RETURN(FitResult fit, FitAnyPrecision(bundle, problem, head, options, on_step, stops_early ? inspect : nullptr));
   if (!first) return trial;
-  adapted.parameters = std::move(fit.parameters);
+  trial.adapted.parameters = std::move(fit.parameters);
+  trial.adapted.posterior = std::move(fit.posterior);
   trial.unknowns = std::move(fit.unknowns);
-  METAEKF_ASSIGN_OR_RETURN(trial.errors, ErrorsOf(adapted, tail));
-  trial.parameters = std::move(adapted.parameters);
+  METAEKF_ASSIGN_OR_RETURN(trial.errors, ErrorsOf(trial.adapted, tail));
   return trial;
 }
 
-/// Q and R from the tail of a context that `parameters` have not seen.
-nssm::FilterNoise NoiseOnTail(const Bundle& bundle, std::vector<double> parameters, const Trajectory& context,
-                              Eigen::Index held_out_from, base::Executor* executor) {
-  if (bundle.noise.process.size() == 0) return bundle.noise;
+/// The noise of a model, adapted to the head of a context, from the tail.
+nssm::FilterNoise NoiseOnTail(const Bundle& adapted, const Trajectory& context, Eigen::Index held_out_from, base::Executor* executor) {
+  if (adapted.noise.process.size() == 0) return adapted.noise;
   // A filter's first window may reach into what has been seen: it is not what is judged.
-  const int64_t begin = bundle.model.spec().is_case_one() ? std::max<int64_t>(0, held_out_from - bundle.model.spec().warmup()) : held_out_from;
-  const absl::StatusOr<Trajectory> run = data::SamplesFrom(context, begin);
-  return filter::Calibrate(bundle, {{std::move(parameters), *run}}, bundle.noise.log_std, executor);
+  const int64_t begin = adapted.model.spec().is_case_one() ? std::max<int64_t>(0, held_out_from - adapted.model.spec().warmup()) : held_out_from;
+  return filter::Calibrate(adapted, {filter::RunOf(adapted, *data::SamplesFrom(context, begin))}, adapted.noise.log_std, executor);
 }
 
 /// Samples of the context's end that are held out.
@@ -413,12 +411,13 @@ int64_t ContextSamplesNeeded(const nssm::ModelSpec& model, const nssm::LossSpec&
   return nssm::SamplesNeeded(model, loss) + model.warmup() + 1;
 }
 
-absl::StatusOr<std::vector<double>> AdaptedParameters(const Bundle& bundle, const Trajectory& context,
-                                                      const AdaptationOptions& options) {
+absl::StatusOr<Bundle> AdaptedBundle(Bundle bundle, const Trajectory& context, const AdaptationOptions& options) {
   METAEKF_ASSIGN_OR_RETURN(const Problem problem, Pose(bundle, context, options));
   METAEKF_ASSIGN_OR_RETURN(FitResult fit,
                            FitAnyPrecision(bundle, problem, problem.context, options, nullptr));
-  return std::move(fit.parameters);
+  bundle.parameters = std::move(fit.parameters);
+  bundle.posterior = std::move(fit.posterior);
+  return bundle;
 }
 
 absl::StatusOr<std::vector<nssm::FilterNoise>> NoiseOfContext(const Bundle& bundle, const Trajectory& context,
@@ -427,12 +426,14 @@ absl::StatusOr<std::vector<nssm::FilterNoise>> NoiseOfContext(const Bundle& bund
   const Eigen::Index held_out_from = context.length() - TailSamples(bundle.model.spec(), context.length());
   METAEKF_ASSIGN_OR_RETURN(const Trajectory head, data::FirstSamples(problem.context, held_out_from));
   problem.tolerance = kTrialTolerance;
-  METAEKF_ASSIGN_OR_RETURN(const FitResult fit, FitAnyPrecision(bundle, problem, head, options, nullptr));
+  METAEKF_ASSIGN_OR_RETURN(FitResult fit, FitAnyPrecision(bundle, problem, head, options, nullptr));
   std::vector<nssm::FilterNoise> noises;
-  Bundle prior = bundle;
+  Bundle adapted = bundle;
+  adapted.parameters = std::move(fit.parameters);
+  adapted.posterior = std::move(fit.posterior);
   for (const double log_std : log_stds) {
-    prior.noise.log_std = log_std;
-    noises.push_back(NoiseOnTail(prior, fit.parameters, context, held_out_from, options.executor));
+    adapted.noise.log_std = log_std;
+    noises.push_back(NoiseOnTail(adapted, context, held_out_from, options.executor));
   }
   return noises;
 }
@@ -458,7 +459,7 @@ absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& c
   METAEKF_ASSIGN_OR_RETURN(Trial trial, RunTrial(bundle, problem, head, tail, options, on_trial_step));
   result.after = std::move(trial.errors);
   result.arx = ArxErrors(head, tail, spec.warmup());
-  result.noise = NoiseOnTail(bundle, std::move(trial.parameters), context, held_out_from, options.executor);
+  result.noise = NoiseOnTail(trial.adapted, context, held_out_from, options.executor);
 
   AdaptationOptions whole = options;
   whole.inner_loop.steps = result.steps = trial.steps;

@@ -63,10 +63,9 @@ struct AdaptationResult {
 /// different units). What did not diverge is better than what did, or is not there.
 bool BetterInFreeRun(const TailErrors& a, const TailErrors& b);
 
-/// The adaptation alone: ω_M from the whole context, all steps, without errors on a tail. Arguments and errors as those of
-/// Adapt.
-absl::StatusOr<std::vector<double>> AdaptedParameters(const nssm::Bundle& bundle, const data::Trajectory& context,
-                                                      const AdaptationOptions& options);
+/// The adaptation alone: `bundle` with ω_M and its posterior from the whole context, all steps, without errors on a tail. Arguments and
+/// errors as those of Adapt.
+absl::StatusOr<nssm::Bundle> AdaptedBundle(nssm::Bundle bundle, const data::Trajectory& context, const AdaptationOptions& options);
 
 /// Q and R as Adapt finds them on the tail, for each of several priors: FilterNoise::log_std. Arguments and errors as those of Adapt.
 absl::StatusOr<std::vector<nssm::FilterNoise>> NoiseOfContext(const nssm::Bundle& bundle, const data::Trajectory& context,

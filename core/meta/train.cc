@@ -127,23 +127,23 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const Trai
                                                        const std::vector<Trajectory>& systems, base::Executor* executor) {
   METAEKF_ASSIGN_OR_RETURN(const AdaptationOptions options, DefaultAdaptation(bundle));
   const int64_t wanted = std::max<int64_t>(spec.context_samples, ContextSamplesNeeded(spec.model, spec.loss));
-  std::vector<std::vector<double>> parameters(systems.size());
+  std::vector<std::optional<Bundle>> adapted(systems.size());
   executor->ParallelFor(systems.size(), [&](size_t i, size_t) {
     const absl::StatusOr<Trajectory> context = data::FirstSamples(systems[i], std::min<int64_t>(systems[i].length(), wanted));
-    absl::StatusOr<std::vector<double>> adapted = AdaptedParameters(bundle, *context, options);
+    absl::StatusOr<Bundle> found = AdaptedBundle(bundle, *context, options);
     // An adaptation that diverges says nothing about noise; the unadapted model stands in.
-    parameters[i] = adapted.ok() ? *std::move(adapted) : bundle.parameters;
+    adapted[i] = found.ok() ? *std::move(found) : bundle;
   });
   filter::NoiseEstimate noise(bundle);
   std::vector<filter::CalibrationRun> runs, later_runs;
   std::vector<Trajectory> contexts;  // of the later runs
   for (size_t i = 0; i < systems.size(); ++i) {
     METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, systems[i]));
-    noise.Add(parameters[i], normalised);
+    noise.Add(adapted[i]->parameters, normalised);
     const int64_t begin = systems[i].length() - wanted < kFewSamples ? 0 : wanted;
     METAEKF_ASSIGN_OR_RETURN(const Trajectory later, data::SamplesFrom(systems[i], begin));
     METAEKF_ASSIGN_OR_RETURN(Trajectory run, data::FirstSamples(later, std::min(later.length(), kCalibrationSamples)));
-    runs.push_back({parameters[i], std::move(run)});
+    runs.push_back(filter::RunOf(*adapted[i], std::move(run)));
     if (begin == 0) continue;
     METAEKF_ASSIGN_OR_RETURN(Trajectory context, data::FirstSamples(systems[i], wanted));
     contexts.push_back(std::move(context));

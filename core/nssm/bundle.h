@@ -12,6 +12,13 @@
 
 namespace metaekf::nssm {
 
+/// An error that lasts, e_t = W c_t with c_{t+1} = φ c_t + √(1 − φ²) ξ_t and c_0, ξ_t ~ N(0, I): a Gauss–Markov process of first order
+/// with the covariance W Wᵀ.
+struct GaussMarkov {
+  Eigen::MatrixXd loadings;  ///< W, n × r; empty where there is no such error
+  double correlation = 0;    ///< φ, of one sample with the next, from 0 to below 1
+};
+
 /// Covariances that a filter starts from, of the filter's own coordinates: physical units in Case II, latents in
 /// Case I (R and outputs are physical in both).
 struct FilterNoise {
@@ -20,6 +27,11 @@ struct FilterNoise {
   Eigen::MatrixXd initial;      ///< covariance of the first state, n × n
   /// How far a system's own Q and R are from these: standard deviation of the logarithm of a variance over the fleet.
   double log_std = 1;
+  /// Errors of f and h that last, beside Q and R, which do not: in Case II, where residuals show them.
+  GaussMarkov process_bias, measurement_bias;
+  /// Deviation of what an adaptation has left open of the parameters, in that of its posterior: a filter's own, whose model is not linear
+  /// in them and whose errors are not all theirs.
+  double parameter_std = 1;
 };
 
 struct ChannelNames {

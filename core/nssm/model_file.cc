@@ -14,7 +14,7 @@ using nlohmann::json;
 
 constexpr char kMetadataKey[] = "metaekf";
 constexpr char kPosteriorName[] = "posterior.information", kCoordinatesName[] = "posterior.coordinates",
-               kProcessNoiseName[] = "noise.process", kMeasurementNoiseName[] = "noise.measurement";
+               kProcessNoiseName[] = "noise.process", kMeasurementNoiseName[] = "noise.measurement", kProcessBiasName[] = "noise.process_bias", kMeasurementBiasName[] = "noise.measurement_bias";
 constexpr char kAdaptedKey[] = "adapted";  // names of the tensors that the coordinates stand for
 constexpr char kPriorPrefix[] = "prior.";
 
@@ -104,6 +104,39 @@ Safetensors::Tensor TensorOf(const char* name, const Eigen::MatrixXd& cov) {
   return {.name = name, .shape = {cov.rows(), cov.cols()}, .values = std::vector<double>(cov.reshaped().begin(), cov.reshaped().end())};
 }
 
+/// Null where there is none.
+json ToJson(const GaussMarkov& bias) {
+  if (bias.loadings.cols() == 0) return json();
+  return {{"loadings", ListOf(bias.loadings)}, {"correlation", bias.correlation}};
+}
+
+bool IsBias(const GaussMarkov& bias, Eigen::Index n) {
+  return bias.loadings.rows() == n && bias.loadings.allFinite() && bias.correlation >= 0 && bias.correlation < 1;
+}
+
+/// An error that lasts, of n components; none where the file says nothing of it.
+GaussMarkov ReadBias(JsonFields* parent, const json& object, const std::string& name, int32_t n) {
+  GaussMarkov bias;
+  const auto it = object.find(name);
+  if (it == object.end() || it->is_null()) return bias;
+  JsonFields fields = parent->Object(name);
+  bias.correlation = fields.Number("correlation", 0, 0, 1);
+  const json rows = it->is_object() ? it->value("loadings", json()) : json();
+  bool valid = rows.is_array() && rows.size() == static_cast<size_t>(n);
+  for (int32_t i = 0; valid && i < n; ++i) {
+    const json& row = rows[static_cast<size_t>(i)];
+    valid = row.is_array() && row.size() == rows[0].size();
+    if (i == 0 && valid) bias.loadings.resize(n, static_cast<Eigen::Index>(row.size()));
+    for (size_t j = 0; valid && j < row.size(); ++j) {
+      valid = row[j].is_number();
+      if (valid) bias.loadings(i, static_cast<Eigen::Index>(j)) = row[j].get<double>();
+    }
+  }
+  parent->Include(fields.status());
+  if (!valid || !IsBias(bias, n)) parent->Fail(name, absl::StrCat("expected loadings of ", n, " rows and a correlation below 1"));
+  return bias;
+}
+
 /// Replaces a covariance by one of the same size.
 absl::Status StoreNoise(const Safetensors::Tensor& tensor, Eigen::MatrixXd* cov) {
   const Eigen::Index n = cov->rows();
@@ -115,6 +148,26 @@ absl::Status StoreNoise(const Safetensors::Tensor& tensor, Eigen::MatrixXd* cov)
     return absl::InvalidArgumentError(absl::StrCat("tensor \"", tensor.name, "\" is not a covariance"));
   }
   *cov = values;
+  return absl::OkStatus();
+}
+
+/// Of n rows of loadings, and φ below them.
+void AppendBias(const char* name, const GaussMarkov& bias, Safetensors* file) {
+  if (bias.loadings.cols() == 0) return;
+  Eigen::MatrixXd values(bias.loadings.rows() + 1, bias.loadings.cols());
+  values << bias.loadings, Eigen::RowVectorXd::Constant(bias.loadings.cols(), bias.correlation);
+  const Eigen::MatrixXd transposed = values.transpose();  // row-major
+  file->tensors.push_back({.name = name, .shape = {values.rows(), values.cols()}, .values = std::vector<double>(transposed.data(), transposed.data() + transposed.size())});
+}
+
+/// Replaces an error of n components that lasts.
+absl::Status StoreBias(const Safetensors::Tensor& tensor, Eigen::Index n, GaussMarkov* bias) {
+  const absl::Status invalid = absl::InvalidArgumentError(absl::StrCat("tensor \"", tensor.name, "\" is not ", n, " rows of loadings and a correlation below 1"));
+  if (tensor.shape.size() != 2 || tensor.shape[0] != n + 1 || tensor.shape[1] == 0) return invalid;
+  const Eigen::MatrixXd values = Eigen::Map<const Eigen::MatrixXd>(tensor.values.data(), tensor.shape[1], tensor.shape[0]).transpose();
+  GaussMarkov read{values.topRows(n), values(n, 0)};
+  if (!IsBias(read, n)) return invalid;
+  *bias = std::move(read);
   return absl::OkStatus();
 }
 
@@ -213,7 +266,10 @@ std::string WriteModelFile(const Bundle& bundle) {
        {{"process_cov", ListOf(bundle.noise.process)},
         {"measurement_cov", ListOf(bundle.noise.measurement)},
         {"initial_cov", ListOf(bundle.noise.initial)},
-        {"log_std", bundle.noise.log_std}}},
+        {"log_std", bundle.noise.log_std},
+        {"process_bias", ToJson(bundle.noise.process_bias)},
+        {"measurement_bias", ToJson(bundle.noise.measurement_bias)},
+        {"parameter_std", bundle.noise.parameter_std}}},
       {"training", bundle.training},
       {"provenance", bundle.provenance},
   };
@@ -259,6 +315,9 @@ absl::StatusOr<Bundle> ReadModelFile(const std::string& bytes) {
   bundle.noise.measurement = ReadCovariance(&noise_fields, noise, "measurement_cov", spec.output_size);
   bundle.noise.initial = ReadCovariance(&noise_fields, noise, "initial_cov", filter_size);
   bundle.noise.log_std = noise_fields.Number("log_std", FilterNoise().log_std, 0, 1e3);
+  bundle.noise.process_bias = ReadBias(&noise_fields, noise, "process_bias", filter_size);
+  bundle.noise.measurement_bias = ReadBias(&noise_fields, noise, "measurement_bias", spec.output_size);
+  bundle.noise.parameter_std = noise_fields.Number("parameter_std", FilterNoise().parameter_std, 0, 1e3);
   METAEKF_RETURN_IF_ERROR(noise_fields.status());
   METAEKF_RETURN_IF_ERROR(fields.status());
   bundle.training = object.value("training", json::object());
@@ -305,6 +364,8 @@ std::string WriteAdaptedSubset(const Bundle& bundle, const nn::Mask& mask) {
   if (bundle.posterior) file.tensors.push_back(TensorOf(*bundle.posterior));
   file.tensors.push_back(TensorOf(kProcessNoiseName, bundle.noise.process));
   file.tensors.push_back(TensorOf(kMeasurementNoiseName, bundle.noise.measurement));
+  AppendBias(kProcessBiasName, bundle.noise.process_bias, &file);
+  AppendBias(kMeasurementBiasName, bundle.noise.measurement_bias, &file);
   return WriteSafetensors(file);
 }
 
@@ -348,6 +409,12 @@ absl::Status ApplyAdaptedSubset(const std::string& bytes, Bundle* bundle) {
     }
     if (tensor.name == kProcessNoiseName || tensor.name == kMeasurementNoiseName) {
       METAEKF_RETURN_IF_ERROR(StoreNoise(tensor, tensor.name == kProcessNoiseName ? &bundle->noise.process : &bundle->noise.measurement));
+      continue;
+    }
+    if (tensor.name == kProcessBiasName || tensor.name == kMeasurementBiasName) {
+      const bool of_process = tensor.name == kProcessBiasName;
+      METAEKF_RETURN_IF_ERROR(StoreBias(tensor, (of_process ? bundle->noise.process : bundle->noise.measurement).rows(),
+                                        of_process ? &bundle->noise.process_bias : &bundle->noise.measurement_bias));
       continue;
     }
     METAEKF_RETURN_IF_ERROR(StoreTensor(tensor, bundle, &seen));

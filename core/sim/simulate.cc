@@ -1,7 +1,9 @@
 #include "core/sim/simulate.h"
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
+#include <mutex>
 #include <utility>
 
 #include "absl/strings/str_join.h"
@@ -112,7 +114,7 @@ absl::Status AddSetting(const std::string& text, std::map<std::string, std::stri
   return absl::OkStatus();
 }
 
-absl::StatusOr<Fleet> Simulate(const Request& request, base::Executor& executor) {
+absl::StatusOr<Fleet> Simulate(const Request& request, base::Executor& executor, const OnSystem& on_system) {
   METAEKF_ASSIGN_OR_RETURN(const System* const system, FindSystem(request.system));
   METAEKF_ASSIGN_OR_RETURN(const Settings settings, Settings::Check(*system, request.settings));
   if (request.systems < 1) {
@@ -133,7 +135,11 @@ absl::StatusOr<Fleet> Simulate(const Request& request, base::Executor& executor)
   fleet.dataset.trajectories.resize(count);
   fleet.parameters.values.resize(request.systems, system->parameters.size());
   std::vector<absl::Status> statuses(count);
+  std::mutex telling;
+  int64_t done = 0;
+  std::atomic<bool> cancelled = false;
   executor.ParallelFor(count, [&](size_t index, size_t) {
+    if (cancelled) return;
     const Eigen::Index row = static_cast<Eigen::Index>(index);
     base::Rng rng(request.seed, index);
     Run run{DrawParameters(*system, request, settings, row, rng), settings, request.steps,
@@ -147,7 +153,11 @@ absl::StatusOr<Fleet> Simulate(const Request& request, base::Executor& executor)
     }
     trajectory->name = absl::StrCat(index);
     fleet.dataset.trajectories[index] = *std::move(trajectory);
+    const std::lock_guard<std::mutex> lock(telling);
+    ++done;
+    if (on_system && !on_system(done)) cancelled = true;
   });
+  if (cancelled) return absl::CancelledError("the simulation was cancelled");
   for (const absl::Status& status : statuses) METAEKF_RETURN_IF_ERROR(status);
 
   for (const Parameter& parameter : system->parameters) {

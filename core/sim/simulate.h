@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <map>
 #include <optional>
 #include <string>
@@ -41,6 +42,8 @@ struct Fleet {
   data::Table parameters;  ///< those used: one row per system, a column for each of the family's
 };
 
+using OnSystem = std::function<bool(int64_t done)>;
+
 /// Draws a fleet of similar systems and simulates each.
 ///
 /// System i takes everything random from its own stream (seed, i), parameters first and always all
@@ -52,7 +55,8 @@ struct Fleet {
 /// one system or step, a table with a column that is not a parameter, one that is fixed by a
 /// setting too or another number of rows than systems, an input that is empty, not finite, of other
 /// channels or of another sample period than the family's, and whatever the family itself refuses,
-/// with the system's number.
-absl::StatusOr<Fleet> Simulate(const Request& request, base::Executor& executor);
+/// with the system's number; Cancelled if on_system said so.
+/// @param on_system  called after each system with how many are done, in one thread at a time; false stops. May be empty.
+absl::StatusOr<Fleet> Simulate(const Request& request, base::Executor& executor, const OnSystem& on_system = nullptr);
 
 }  // namespace metaekf::sim

@@ -61,12 +61,10 @@ BoucWenErrors AdaptedBoucWen(int64_t samples) {
   const Trajectory context =
       *data::FirstSamples(Simulated("bouc-wen", 4242, {}, {{"nominal", "1"}, {"noise_std", "7.5e-6"}}), samples);
   const Trajectory test = Simulated("bouc-wen", 4243, {}, {{"nominal", "1"}, {"period", "2048"}});
-  nssm::Bundle adapted = *bundle;
-  const auto parameters = meta::AdaptedParameters(*bundle, context, *meta::DefaultAdaptation(*bundle));
-  EXPECT_TRUE(parameters.ok()) << parameters.status();
-  adapted.parameters = *parameters;
+  const auto adapted = meta::AdaptedBundle(*bundle, context, *meta::DefaultAdaptation(*bundle));
+  EXPECT_TRUE(adapted.ok()) << adapted.status();
   const auto error = [&](nssm::PredictionMode mode) {
-    return nssm::ScorePredictions({test.outputs}, {nssm::Predict(adapted, test, mode)->outputs}).rmse[0];
+    return nssm::ScorePredictions({test.outputs}, {nssm::Predict(*adapted, test, mode)->outputs}).rmse[0];
   };
   return {error(nssm::PredictionMode::kOneStep), error(nssm::PredictionMode::kSimulate)};
 }
@@ -86,13 +84,10 @@ double AdaptedVanDerPol(uint64_t seed) {
   EXPECT_TRUE(bundle.ok()) << bundle.status();
   const Trajectory noisy = Simulated("van-der-pol", seed, 3400, {{"noise_std", "0.005"}});
   const Trajectory clean = Simulated("van-der-pol", seed, 3400, {});
-  nssm::Bundle adapted = *bundle;
-  const auto parameters =
-      meta::AdaptedParameters(*bundle, *data::FirstSamples(noisy, 400), *meta::DefaultAdaptation(*bundle));
-  EXPECT_TRUE(parameters.ok()) << parameters.status();
-  adapted.parameters = *parameters;
+  const auto adapted = meta::AdaptedBundle(*bundle, *data::FirstSamples(noisy, 400), *meta::DefaultAdaptation(*bundle));
+  EXPECT_TRUE(adapted.ok()) << adapted.status();
   const Trajectory later = *data::SamplesFrom(clean, 399);
-  const Eigen::MatrixXd states = nssm::Predict(adapted, later, nssm::PredictionMode::kSimulate)->states;
+  const Eigen::MatrixXd states = nssm::Predict(*adapted, later, nssm::PredictionMode::kSimulate)->states;
   return (states - later.states).rightCols(3000).squaredNorm();
 }
 

@@ -24,7 +24,7 @@ std::vector<CalibrationRun> Runs(const nssm::Bundle& bundle, int count, Index st
       trajectory.inputs(0, t) = truth.rng.Normal();
       truth.Advance(trajectory.inputs(0, t));
     }
-    runs.push_back({bundle.parameters, std::move(trajectory)});
+    runs.push_back(RunOf(bundle, std::move(trajectory)));
   }
   return runs;
 }
@@ -75,6 +75,42 @@ TEST(CalibrateTest, CountsThatErrorsOfAModelLast) {
   const nssm::FilterNoise calibrated = Calibrate(bundle, seen, kNoPrior, base::CallingThread());
   EXPECT_LT(share_held(residual, unseen), 0.93);
   EXPECT_NEAR(share_held(calibrated, unseen), 0.95, 0.02);
+}
+
+// Of a system that errs in ways that last, from wrong ideas of how much and how long: bounds hold what they say, and innovations are as
+// large as they say, which no Q and R alone can have together.
+TEST(CalibrateTest, FindsErrorsThatLast) {
+  const ErringSystem c;
+  nssm::Bundle bundle = c.Known();
+  bundle.noise.process_bias.loadings *= 0.4;
+  bundle.noise.measurement_bias.loadings *= 2;
+  bundle.noise.measurement_bias.correlation = 0.6;
+  bundle.noise.measurement *= 2;
+  std::vector<CalibrationRun> runs;
+  for (uint64_t seed = 1; seed <= 10; ++seed) runs.push_back(RunOf(bundle, c.Record(seed, 400)));
+  const auto executor = base::MakeThreadExecutor(2);
+  const auto judge = [&](const nssm::FilterNoise& noise) {
+    bundle.noise = noise;
+    double held = 0, nis = 0, all = 0;
+    for (uint64_t seed = 101; seed <= 110; ++seed) {
+      Filter filter(bundle);
+      const data::Trajectory run = c.Record(seed, 400);
+      for (Index t = 0; t < run.length(); ++t, all += 2) {
+        EXPECT_TRUE(filter.ekf.Step(run.inputs.col(t), run.outputs.col(t), filter.scratch.get(), &filter.estimate).ok());
+        for (Index i = 0; i < 2; ++i) held += std::abs(filter.estimate.mean[i] - run.states(i, t)) <= 1.96 * std::sqrt(filter.estimate.cov(i, i)) ? 1 : 0;
+        nis += filter.estimate.nis;
+      }
+    }
+    return std::pair{held / all, nis / all};
+  };
+  const nssm::FilterNoise found = Calibrate(bundle, runs, kNoPrior, executor.get());
+  bundle.noise.process_bias = bundle.noise.measurement_bias = {};
+  const nssm::FilterNoise white = Calibrate(bundle, runs, kNoPrior, executor.get());
+  const auto [held, nis] = judge(found);
+  EXPECT_NEAR(held, 0.95, 0.02);
+  EXPECT_NEAR(nis, 1, 0.1);
+  const auto [white_held, white_nis] = judge(white);
+  EXPECT_GT(std::abs(white_held - 0.95) + std::abs(white_nis - 1), std::abs(held - 0.95) + std::abs(nis - 1) + 0.05);
 }
 
 TEST(CalibrateTest, AStrongPriorKeepsWhatIsThere) {

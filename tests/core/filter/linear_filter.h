@@ -1,10 +1,12 @@
 #pragma once
 
 #include <Eigen/Cholesky>
+#include <cmath>
 #include <limits>
 #include <memory>
 
 #include "core/base/rng.h"
+#include "core/data/trajectory.h"
 #include "core/filter/ekf.h"
 #include "tests/support/bundles.h"
 
@@ -65,6 +67,38 @@ struct LinearTruth {
   LinearSystem system;
   base::Rng rng;
   Eigen::VectorXd state;
+};
+
+/// A linear system whose f and h err in ways that last.
+struct ErringSystem {
+  LinearSystem system;
+  nssm::GaussMarkov of_f{Eigen::MatrixXd{{0.2}, {0.1}}, 0.95}, of_h{Eigen::MatrixXd{{0.8, 0}, {0.2, 0.5}}, 0.9};
+
+  nssm::Bundle Known() const {
+    nssm::Bundle bundle = LinearBundle(system);
+    bundle.noise.process_bias = of_f;
+    bundle.noise.measurement_bias = of_h;
+    return bundle;
+  }
+  /// As it happens, states and measurements with the errors in them.
+  data::Trajectory Record(uint64_t seed, Eigen::Index steps) const {
+    LinearTruth truth(system, seed);
+    Eigen::VectorXd c_f = RandomVector(&truth.rng, 1), c_h = RandomVector(&truth.rng, 2);
+    const auto next = [&](const Eigen::VectorXd& c, double correlation) {
+      return Eigen::VectorXd(correlation * c + std::sqrt(1 - correlation * correlation) * RandomVector(&truth.rng, c.size()));
+    };
+    data::Trajectory trajectory{.inputs = Eigen::MatrixXd(1, steps), .outputs = Eigen::MatrixXd(2, steps), .states = Eigen::MatrixXd(2, steps)};
+    for (Eigen::Index t = 0; t < steps; ++t) {
+      trajectory.states.col(t) = truth.state;
+      trajectory.outputs.col(t) = truth.Measure() + of_h.loadings * c_h;
+      trajectory.inputs(0, t) = truth.rng.Normal();
+      truth.Advance(trajectory.inputs(0, t));
+      truth.state += of_f.loadings * c_f;
+      c_f = next(c_f, of_f.correlation);
+      c_h = next(c_h, of_h.correlation);
+    }
+    return trajectory;
+  }
 };
 
 }  // namespace metaekf::filter

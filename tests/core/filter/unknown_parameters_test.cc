@@ -54,47 +54,6 @@ TEST(UnknownParametersTest, DirectionsInWhichNoSystemsDifferAreLeftOut) {
   }
 }
 
-// Of every kind of model, against central differences.
-TEST(UnknownParametersTest, JacobiansByStateAndDirectionsMatchDifferences) {
-  for (const nssm::ModelCase& c : nssm::ModelCases()) {
-    SCOPED_TRACE(c.name);
-    const nssm::Model model = *nssm::Model::Create(c.model);
-    const auto filter_model = FilterModel::Create(nssm::Bundle{.model = model});
-    const Index n = filter_model->state_size(), n_y = c.model.output_size, r = 3;
-    base::Rng rng(9);
-    MatrixXd V(model.layout().size(), r);
-    for (Index k = 0; k < r; ++k) V.col(k) = 0.1 * RandomVector(&rng, V.rows());
-    const auto parameters = filter_model->Prepare(nssm::RandomParameters(model, 5), V);
-    const auto scratch = filter_model->MakeScratch();
-    const VectorXd x = RandomVector(&rng, n + r), u = RandomVector(&rng, c.model.input_size);
-    VectorXd f(n + r), f_up(n + r), f_down(n + r), h(n_y), h_up(n_y), h_down(n_y);
-    MatrixXd F(n + r, n + r), H(n_y, n + r), unused_F(n + r, n + r), unused_H(n_y, n + r);
-    filter_model->Transition(*parameters, x, u, &f, &F, scratch.get());
-    filter_model->Measurement(*parameters, x, u, &h, &H, scratch.get());
-    EXPECT_EQ(f.tail(r), x.tail(r));
-    constexpr double kStep = 1e-6;
-    for (Index j = 0; j < n + r; ++j) {
-      VectorXd up = x, down = x;
-      up[j] += kStep;
-      down[j] -= kStep;
-      filter_model->Transition(*parameters, up, u, &f_up, &unused_F, scratch.get());
-      filter_model->Transition(*parameters, down, u, &f_down, &unused_F, scratch.get());
-      filter_model->Measurement(*parameters, up, u, &h_up, &unused_H, scratch.get());
-      filter_model->Measurement(*parameters, down, u, &h_down, &unused_H, scratch.get());
-      EXPECT_LT((F.col(j) - (f_up - f_down) / (2 * kStep)).norm(), 1e-7 * (1 + F.norm())) << j;
-      EXPECT_LT((H.col(j) - (h_up - h_down) / (2 * kStep)).norm(), 1e-7 * (1 + H.norm())) << j;
-    }
-    // A state without z is the model's own.
-    VectorXd f_own(n), f_zero(n + r), zero = VectorXd::Zero(n + r);
-    MatrixXd F_own(n, n);
-    zero.head(n) = x.head(n);
-    filter_model->Transition(*parameters, x.head(n), u, &f_own, &F_own, scratch.get());
-    filter_model->Transition(*parameters, zero, u, &f_zero, &unused_F, scratch.get());
-    EXPECT_EQ(f_own, f_zero.head(n));
-    EXPECT_EQ(F_own, unused_F.topLeftCorner(n, n));
-  }
-}
-
 /// A linear system whose transition has an unknown offset.
 struct UnknownOffset {
   LinearSystem system;

@@ -32,10 +32,10 @@ TEST(AdaptTest, GradientStepsFromScratchStopWhereTheTailIsSimulatedBest) {
   EXPECT_GT(stopped.steps, 0);
   AdaptationOptions as_many = options;
   as_many.inner_loop.steps = stopped.steps;
-  EXPECT_EQ(*AdaptedParameters(bundle, system, as_many), stopped.parameters);
+  EXPECT_EQ(AdaptedBundle(bundle, system, as_many)->parameters, stopped.parameters);
   // The end of the trial is no better on the tail than where it stopped: it is the trial of so many steps that tells its errors.
   nssm::Bundle to_the_end = bundle;
-  to_the_end.parameters = *AdaptedParameters(bundle, *data::FirstSamples(system, system.length() - stopped.tail_samples), options);
+  to_the_end.parameters = AdaptedBundle(bundle, *data::FirstSamples(system, system.length() - stopped.tail_samples), options)->parameters;
   const Trajectory tail = *data::SamplesFrom(system, system.length() - stopped.tail_samples);
   const auto simulated = nssm::Predict(to_the_end, tail, nssm::PredictionMode::kSimulate);
   EXPECT_GT(nssm::ScorePredictions({tail.outputs}, {simulated->outputs}).rmse[0], stopped.after.simulate[0]);

@@ -98,10 +98,12 @@ TEST(EmpiricalBayesTest, FiltersOfNewSystemsHoldTheTruth) {
   for (uint64_t seed = 100; seed < 120; ++seed) {
     MatrixXd clean;
     Trajectory system = Resonator(400, kNoise, seed, &clean);
-    const AdaptationResult result = *Adapt(bundle, *data::FirstSamples(system, 100), *DefaultAdaptation(bundle), nullptr);
+    AdaptationResult result = *Adapt(bundle, *data::FirstSamples(system, 100), *DefaultAdaptation(bundle), nullptr);
     nssm::Bundle adapted = bundle;
-    adapted.noise = result.noise;
-    filter::Ekf ekf = *filter::Ekf::Create(adapted, model, model->Prepare(result.parameters), {});
+    adapted.parameters = std::move(result.parameters);
+    adapted.posterior = std::move(result.posterior);
+    adapted.noise = std::move(result.noise);
+    filter::Ekf ekf = *filter::Ekf::Create(adapted, model, model->Prepare(adapted), {});
     filter::Estimate estimate = ekf.MakeEstimate();
     for (Eigen::Index t = 100; t < 400; ++t) {
       ASSERT_TRUE(ekf.Step(system.inputs.col(t), system.outputs.col(t), scratch.get(), &estimate).ok());
@@ -173,7 +175,7 @@ TEST(EmpiricalBayesTest, APriorOfTwoFactorsIsOneAndIsAdaptedUnder) {
     const Trajectory system = Resonators(1, 800, seed).trajectories[0];
     const Trajectory context = *data::FirstSamples(system, 60);
     nssm::Bundle adapted = bundle;
-    adapted.parameters = *AdaptedParameters(bundle, context, *DefaultAdaptation(bundle));
+    adapted.parameters = AdaptedBundle(bundle, context, *DefaultAdaptation(bundle))->parameters;
     const auto error = [&](const nssm::Bundle& model_of) {
       return nssm::ScorePredictions({system.outputs}, {nssm::Predict(model_of, system, nssm::PredictionMode::kSimulate)->outputs}).rmse[0];
     };

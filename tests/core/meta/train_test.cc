@@ -213,11 +213,11 @@ TEST(TrainTest, LearnedRatesGoIntoTheModelFileAndAreAdaptedWith) {
   const Trajectory system = Fleet(1, 60, 3).trajectories[0];
   AdaptationOptions one_rate = options;
   one_rate.inner_loop.tensor_rates.clear();
-  EXPECT_NE(*AdaptedParameters(bundle, system, options), *AdaptedParameters(bundle, system, one_rate));
+  EXPECT_NE(AdaptedBundle(bundle, system, options)->parameters, AdaptedBundle(bundle, system, one_rate)->parameters);
   EXPECT_TRUE(DefaultAdaptation(bundle, AdaptationMethod::kAdam)->inner_loop.tensor_rates.empty());
   AdaptationOptions unknown = options;
   unknown.inner_loop.tensor_rates = {{"engine", 1}};
-  EXPECT_NE(std::string(AdaptedParameters(bundle, system, unknown).status().message()).find("\"engine\""), std::string::npos);
+  EXPECT_NE(std::string(AdaptedBundle(bundle, system, unknown).status().message()).find("\"engine\""), std::string::npos);
 }
 
 // What does not adapt is what MAML has found, whatever the fits that follow do with the rest.
@@ -392,7 +392,7 @@ TEST(TrainTest, AModelOfImplicitMamlIsPulledToItsStartAtAdaptationToo) {
   AdaptationOptions options = *DefaultAdaptation(bundle);
   const auto distance = [&](double proximal) {
     options.inner_loop.proximal = proximal;
-    const std::vector<double> adapted = *AdaptedParameters(bundle, system, options);
+    const std::vector<double> adapted = AdaptedBundle(bundle, system, options)->parameters;
     double squares = 0;
     for (size_t i = 0; i < adapted.size(); ++i) squares += std::pow(adapted[i] - bundle.parameters[i], 2);
     return std::sqrt(squares);
@@ -422,7 +422,7 @@ TEST(TrainTest, AModelOfImplicitMamlByLevenbergMarquardtAdaptsToTheMinimumItWasT
   AdaptationOptions descent = *DefaultAdaptation(bundle, AdaptationMethod::kGradientDescent);
   descent.inner_loop.steps = 5000;
   descent.inner_loop.learning_rate = 0.05;
-  const std::vector<double> there = *AdaptedParameters(bundle, system, descent);
+  const std::vector<double> there = AdaptedBundle(bundle, system, descent)->parameters;
   double way = 0, apart = 0;
   for (size_t i = 0; i < there.size(); ++i) {
     way += std::pow(there[i] - bundle.parameters[i], 2);

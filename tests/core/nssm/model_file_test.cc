@@ -102,6 +102,51 @@ TEST(ModelFileTest, TheNoiseOfAnAdaptedModelGoesWithIt) {
   }
 }
 
+TEST(ModelFileTest, ErrorsThatLastAreKeptInBothKindsOfFile) {
+  for (const ModelCase& c : ModelCases()) {
+    SCOPED_TRACE(c.name);
+    Bundle base = SomeBundle(c);
+    const Eigen::Index n = base.noise.process.rows(), n_y = base.noise.measurement.rows();
+    base.noise.process_bias = {Eigen::MatrixXd::Random(n, 2), 0.9};
+    base.noise.measurement_bias = {Eigen::MatrixXd::Random(n_y, 1), 0.1};
+    base.noise.parameter_std = 0.3;
+    const absl::StatusOr<Bundle> back = ReadModelFile(WriteModelFile(base));
+    ASSERT_TRUE(back.ok()) << back.status();
+    EXPECT_EQ(back->noise.process_bias.loadings, base.noise.process_bias.loadings);
+    EXPECT_EQ(back->noise.process_bias.correlation, 0.9);
+    EXPECT_EQ(back->noise.measurement_bias.loadings, base.noise.measurement_bias.loadings);
+    EXPECT_EQ(back->noise.parameter_std, 0.3);
+    Bundle adapted = base;
+    adapted.noise.process_bias.loadings *= 2;
+    adapted.noise.process_bias.correlation = 0.95;
+    const std::string subset = WriteAdaptedSubset(adapted, nn::Mask(base.model.layout().tensors().size(), false));
+    Bundle restored = base;
+    ASSERT_TRUE(ApplyAdaptedSubset(subset, &restored).ok());
+    EXPECT_EQ(restored.noise.process_bias.loadings, adapted.noise.process_bias.loadings);
+    EXPECT_EQ(restored.noise.process_bias.correlation, 0.95);
+    EXPECT_EQ(restored.noise.measurement_bias.loadings, base.noise.measurement_bias.loadings);
+  }
+}
+
+TEST(ModelFileTest, ErrorsThatLastButCannotAreRefused) {
+  const Bundle base = SomeBundle(ModelCases().front());
+  const Eigen::Index n = base.noise.process.rows();
+  const std::vector<GaussMarkov> wrong = {{Eigen::MatrixXd::Ones(n + 1, 1), 0.5},
+                                          {Eigen::MatrixXd::Ones(n, 1), 1},
+                                          {Eigen::MatrixXd::Ones(n, 1), -0.5},
+                                          {Eigen::MatrixXd::Constant(n, 1, std::numeric_limits<double>::quiet_NaN()), 0.5}};
+  for (const GaussMarkov& bias : wrong) {
+    Bundle bundle = base;
+    bundle.noise.process_bias = bias;
+    const absl::Status refused = ReadModelFile(WriteModelFile(bundle)).status();
+    EXPECT_NE(std::string(refused.message()).find("process_bias"), std::string::npos) << refused;
+    Bundle restored = base;
+    const absl::Status unfit = ApplyAdaptedSubset(WriteAdaptedSubset(bundle, nn::Mask(base.model.layout().tensors().size(), false)), &restored);
+    EXPECT_NE(std::string(unfit.message()).find("noise.process_bias"), std::string::npos) << unfit;
+    EXPECT_EQ(restored.noise.process_bias.loadings.size(), 0);
+  }
+}
+
 TEST(ModelFileTest, CoordinatesNeedTheDirectionsOfTheirBase) {
   Bundle base = SomeBundle(ModelCases().front());
   const nn::Mask mask = *nn::ParseMask("output_decoder.0.bias", base.model.layout());
