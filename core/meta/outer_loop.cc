@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <numbers>
 #include <optional>
 
 #include "core/base/numbers.h"
@@ -12,6 +11,7 @@
 #include "core/meta/adam.h"
 #include "core/meta/linear_state_start.h"
 #include "core/meta/meta_gradient.h"
+#include "core/meta/training_schedule.h"
 
 namespace metaekf::meta {
 namespace {
@@ -24,46 +24,6 @@ constexpr int kValidationDraws = 2;          // context and target sets per held
 constexpr int kCurvatureSystems = 16;
 constexpr double kTrainingLossWeight = 0.1;  // of the newest step in the running mean
 constexpr double kHopeless = 1e6;            // times the first loss: from there no training comes back
-
-/// Along half a cosine from `start` to `end` while `step` goes from 0 to steps − 1.
-double CosineDecay(double start, double end, int32_t step, int32_t steps) {
-  const double share = steps > 1 ? static_cast<double>(step) / (steps - 1) : 1;
-  return end + (start - end) * 0.5 * (1 + std::cos(std::numbers::pi * share));
-}
-
-double LearningRate(const TrainingSpec& spec, int32_t iteration) {
-  const int32_t warmup = spec.warmup_iterations;
-  return iteration < warmup
-             ? CosineDecay(spec.warmup_lr, spec.outer_lr, iteration, warmup)
-             : CosineDecay(spec.outer_lr, spec.final_outer_lr, iteration - warmup, spec.iterations - warmup);
-}
-
-/// Steps of the longest rollouts that an iteration has: short in the warm-up, then doubling at even distances while they grow,
-/// of whole sets up to the length of the shorter set.
-int32_t HorizonOf(const TrainingSpec& spec, int32_t iteration) {
-  const int32_t shorter_set = std::min(spec.context_samples, spec.target_samples);
-  const int32_t full = spec.loss.horizon == nssm::LossSpec::kWholeSet
-                           ? nssm::ShapeOfLoss(spec.model, spec.loss, shorter_set)->horizon
-                           : spec.loss.horizon;
-  const int32_t first = std::min(spec.warmup_horizon, full), step = iteration - spec.warmup_iterations;
-  if (step < 0) return first;
-  if (step >= spec.horizon_growth_iterations) return full;
-  const int32_t lengths = static_cast<int32_t>(std::ceil(std::log2(static_cast<double>(full) / first)));
-  if (lengths == 0) return full;
-  return first << (int64_t{step} * lengths / spec.horizon_growth_iterations);
-}
-
-/// What an iteration trains by. The warm-up is a training of its own: supervised.
-TrainingSpec SpecOf(const TrainingSpec& spec, int32_t iteration) {
-  TrainingSpec own = spec;
-  if (iteration < spec.warmup_iterations) own.algorithm = Algorithm::kSupervised;
-  if (HorizonOf(spec, iteration) != HorizonOf(spec, spec.iterations)) {
-    own.loss.horizon = HorizonOf(spec, iteration);
-    // One rollout after the other, as many samples as the one of a whole set has.
-    if (spec.loss.horizon == nssm::LossSpec::kWholeSet) own.loss.stride = own.loss.horizon;
-  }
-  return own;
-}
 
 /// Of MIXED_EFFECTS: where each training system's own δ are among the variables, and which of ω they are added to.
 class OwnEffects {
