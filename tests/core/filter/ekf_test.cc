@@ -283,14 +283,20 @@ TEST(EkfTest, AStepDoesNotAllocate) {
   for (const nssm::ModelCase& c : nssm::ModelCases()) {
     nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(c.model));
     bundle.parameters = nssm::RandomParameters(bundle.model, 3);
+    bundle.noise.process_bias = {MatrixXd::Ones(bundle.noise.process.rows(), 2), 0.9};
+    bundle.noise.measurement_bias = {MatrixXd::Ones(bundle.noise.measurement.rows(), 1), 0.9};
+    const MatrixXd unknown = MatrixXd::Constant(bundle.model.layout().size(), 2, 1e-3);
     Filter filter(bundle);
-    const VectorXd u = VectorXd::Ones(c.model.input_size), y = VectorXd::Ones(c.model.output_size);
-    for (int t = 0; t < 5; ++t) {
-      const long before = support::allocations;
-      ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
-      const bool moved = bundle.model.output_set() != nullptr || filter.estimate.projection > 0;
-      if (moved) continue;
-      EXPECT_EQ(support::allocations, before) << c.name;
+    for (const bool with_unknown : {false, true}) {
+      if (with_unknown) filter.ekf = *Ekf::Create(bundle, filter.model, filter.model->Prepare(bundle.parameters, unknown), {});
+      const VectorXd u = VectorXd::Ones(c.model.input_size), y = VectorXd::Ones(c.model.output_size);
+      for (int t = 0; t < 5; ++t) {
+        const long before = support::allocations;
+        ASSERT_TRUE(filter.ekf.Step(u, y, filter.scratch.get(), &filter.estimate).ok());
+        const bool moved = bundle.model.output_set() != nullptr || filter.estimate.projection > 0;
+        if (moved) continue;
+        EXPECT_EQ(support::allocations, before) << c.name << (with_unknown ? ", parameters unknown" : "");
+      }
     }
   }
 }
