@@ -45,9 +45,9 @@ constexpr char kUniversal[] = R"json({
 })json";
 
 /// Of a quick study.
-constexpr char kShortPrior[] = R"json({"horizon_growth_iterations": 4400, "gaussian_prior": {"meta_iterations": 6200}})json";
-constexpr char kShortMaml[] = R"json({"iterations": 6100, "warmup_iterations": 5700, "horizon_growth_iterations": 150})json";
-constexpr char kShortUniversal[] = R"json({"iterations": 6200, "horizon_growth_iterations": 4400})json";
+constexpr char kShortPrior[] = R"json({"horizon_growth_iterations": 3500, "gaussian_prior": {"meta_iterations": 5000}})json";
+constexpr char kShortMaml[] = R"json({"iterations": 4900, "warmup_iterations": 4500, "horizon_growth_iterations": 150})json";
+constexpr char kShortUniversal[] = R"json({"iterations": 5000, "horizon_growth_iterations": 3500})json";
 /// To see that everything runs.
 constexpr char kTiny[] = R"json({
   "iterations": 8, "horizon_growth_iterations": 2, "task_batch": 2, "target_samples": 60, "context_samples": 60,

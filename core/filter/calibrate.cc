@@ -25,7 +25,8 @@ namespace {
 constexpr double kFar = 3;               // standard deviations
 constexpr double kProbe = 0.4;           // of ln d², to see a slope and a curvature
 constexpr double kWorthwhile = 1e-3;     // of the likelihood, per sample and entry
-constexpr int kRounds = 6;               // of a model that follows its system two or three do
+constexpr int kRounds = 6;               // of a fleet; of a model that follows its system two or three do
+constexpr int kOwnRounds = 2;            // of a system's own noise, which does not go far from the fleet's
 constexpr double kLargestMove = 2;       // of ln d²
 constexpr double kLeastShare = 0.2;      // of a move
 constexpr double kLargest = 30;          // |ln d²|: 10¹³
@@ -299,7 +300,7 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
     }
   };
   double before = kFailed;
-  for (int round = 0; round < kRounds && value > before + kWorthwhile * static_cast<double>(layout.size()); ++round) {
+  for (int round = 0; round < (fleet ? kRounds : kOwnRounds) && value > before + kWorthwhile * static_cast<double>(layout.size()); ++round) {
     before = value;
     // What Q and R can trade with each other is seen along these two; then every entry goes where its own parabola has its top.
     for (const VectorXd& together : Together(layout)) improve(TopOfParabola(objective, best, value, together) * together);

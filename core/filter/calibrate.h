@@ -35,7 +35,7 @@ CalibrationRun RunOf(const nssm::Bundle& adapted, data::Trajectory trajectory);
 ///   1. of a fleet, all of Q and all of R move in great steps while that helps: where filters lose track, little steps lead nowhere;
 ///   2. in Case II, every entry of D moves in proportion to the errors of its own;
 ///   3. in ln d², all of Q, all of R and then every number go to the tops of parabolas through three values each, until a round is worth
-///      less than 1e-3 a number, six times at most, on the beginnings of recordings alone where there are many numbers;
+///      less than 1e-3 a number, of a fleet six times and else twice at most, on the beginnings of recordings alone where there are many numbers;
 ///   4. where these were only beginnings, 2 once more: some errors take long to grow.
 ///
 /// @param bundle  with Q₀, R₀ and P₀ in its noise. @param runs  at least one, of systems that the parameters were not fitted to, or of
