@@ -360,12 +360,17 @@ absl::StatusOr<Trial> RunTrial(const Bundle& bundle, const Problem& problem, con
   return trial;
 }
 
-/// The noise of a model, adapted to the head of a context, from the tail.
-nssm::FilterNoise NoiseOnTail(const Bundle& adapted, const Trajectory& context, Eigen::Index held_out_from, base::Executor* executor) {
-  if (adapted.noise.process.size() == 0) return adapted.noise;
+/// The tail of a context, for a model adapted to its head.
+filter::CalibrationRun TailOf(const Bundle& adapted, const Trajectory& context, Eigen::Index held_out_from) {
   // A filter's first window may reach into what has been seen: it is not what is judged.
   const int64_t begin = adapted.model.spec().is_case_one() ? std::max<int64_t>(0, held_out_from - adapted.model.spec().warmup()) : held_out_from;
-  return filter::Calibrate(adapted, {filter::RunOf(adapted, *data::SamplesFrom(context, begin))}, adapted.noise.log_std, executor);
+  return filter::RunOf(adapted, *data::SamplesFrom(context, begin));
+}
+
+/// The noise of an adapted model from what it has not seen.
+nssm::FilterNoise OwnNoise(const Bundle& adapted, const filter::CalibrationRun& tail, double log_std, base::Executor* executor) {
+  if (adapted.noise.process.size() == 0) return adapted.noise;
+  return filter::Calibrate(adapted, {tail}, log_std, executor);
 }
 
 /// Samples of the context's end that are held out.
@@ -431,10 +436,8 @@ absl::StatusOr<std::vector<nssm::FilterNoise>> NoiseOfContext(const Bundle& bund
   Bundle adapted = bundle;
   adapted.parameters = std::move(fit.parameters);
   adapted.posterior = std::move(fit.posterior);
-  for (const double log_std : log_stds) {
-    adapted.noise.log_std = log_std;
-    noises.push_back(NoiseOnTail(adapted, context, held_out_from, options.executor));
-  }
+  const filter::CalibrationRun tail = TailOf(adapted, context, held_out_from);
+  for (const double log_std : log_stds) noises.push_back(OwnNoise(adapted, tail, log_std, options.executor));
   return noises;
 }
 
@@ -459,7 +462,7 @@ absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& c
   METAEKF_ASSIGN_OR_RETURN(Trial trial, RunTrial(bundle, problem, head, tail, options, on_trial_step));
   result.after = std::move(trial.errors);
   result.arx = ArxErrors(head, tail, spec.warmup());
-  result.noise = NoiseOnTail(trial.adapted, context, held_out_from, options.executor);
+  result.noise = OwnNoise(trial.adapted, TailOf(trial.adapted, context, held_out_from), bundle.noise.log_std, options.executor);
 
   AdaptationOptions whole = options;
   whole.inner_loop.steps = result.steps = trial.steps;

@@ -1,6 +1,7 @@
 #include "core/nssm/model_file.h"
 
 #include <algorithm>
+#include <optional>
 
 #include "absl/strings/str_join.h"
 #include "core/base/status.h"
@@ -46,24 +47,31 @@ data::ChannelScaling ReadScaling(JsonFields* parent, const std::string& name, in
   return scaling;
 }
 
-/// A symmetric matrix, n × n, row by row.
-Eigen::MatrixXd ReadCovariance(JsonFields* parent, const json& object, const std::string& name, int32_t n) {
-  Eigen::MatrixXd matrix = Eigen::MatrixXd::Zero(n, n);
-  const auto it = object.find(name);
-  bool valid = it != object.end() && it->is_array() && static_cast<int32_t>(it->size()) == n;
-  for (int32_t i = 0; valid && i < n; ++i) {
-    const json& row = (*it)[static_cast<size_t>(i)];
-    valid = row.is_array() && static_cast<int32_t>(row.size()) == n;
-    for (int32_t j = 0; valid && j < n; ++j) {
-      valid = row[static_cast<size_t>(j)].is_number();
-      if (valid) matrix(i, j) = row[static_cast<size_t>(j)].get<double>();
+/// n rows of numbers, all as long; nothing where it is not that.
+std::optional<Eigen::MatrixXd> ReadRows(const json& rows, int32_t n) {
+  if (!rows.is_array() || rows.size() != static_cast<size_t>(n)) return std::nullopt;
+  Eigen::MatrixXd matrix(n, n > 0 ? static_cast<Eigen::Index>(rows[0].size()) : 0);
+  for (Eigen::Index i = 0; i < matrix.rows(); ++i) {
+    const json& row = rows[static_cast<size_t>(i)];
+    if (!row.is_array() || static_cast<Eigen::Index>(row.size()) != matrix.cols()) return std::nullopt;
+    for (Eigen::Index j = 0; j < matrix.cols(); ++j) {
+      const json& value = row[static_cast<size_t>(j)];
+      if (!value.is_number()) return std::nullopt;
+      matrix(i, j) = value.get<double>();
     }
   }
-  if (!valid || !matrix.allFinite() || !matrix.isApprox(matrix.transpose(), 1e-9) ||
-      (matrix.diagonal().array() < 0).any()) {
-    parent->Fail(name, absl::StrCat("expected a symmetric matrix of ", n, " × ", n, " numbers"));
-  }
   return matrix;
+}
+
+/// A symmetric matrix, n × n, row by row.
+Eigen::MatrixXd ReadCovariance(JsonFields* parent, const json& object, const std::string& name, int32_t n) {
+  const std::optional<Eigen::MatrixXd> matrix = ReadRows(object.value(name, json()), n);
+  if (matrix && matrix->cols() == n && matrix->allFinite() && matrix->isApprox(matrix->transpose(), 1e-9) &&
+      (matrix->diagonal().array() >= 0).all()) {
+    return *matrix;
+  }
+  parent->Fail(name, absl::StrCat("expected a symmetric matrix of ", n, " × ", n, " numbers"));
+  return Eigen::MatrixXd::Zero(n, n);
 }
 
 std::vector<std::string> ReadNames(JsonFields* fields, const json& object, const std::string& name, int32_t count) {
@@ -121,19 +129,10 @@ GaussMarkov ReadBias(JsonFields* parent, const json& object, const std::string& 
   if (it == object.end() || it->is_null()) return bias;
   JsonFields fields = parent->Object(name);
   bias.correlation = fields.Number("correlation", 0, 0, 1);
-  const json rows = it->is_object() ? it->value("loadings", json()) : json();
-  bool valid = rows.is_array() && rows.size() == static_cast<size_t>(n);
-  for (int32_t i = 0; valid && i < n; ++i) {
-    const json& row = rows[static_cast<size_t>(i)];
-    valid = row.is_array() && row.size() == rows[0].size();
-    if (i == 0 && valid) bias.loadings.resize(n, static_cast<Eigen::Index>(row.size()));
-    for (size_t j = 0; valid && j < row.size(); ++j) {
-      valid = row[j].is_number();
-      if (valid) bias.loadings(i, static_cast<Eigen::Index>(j)) = row[j].get<double>();
-    }
-  }
+  const std::optional<Eigen::MatrixXd> loadings = ReadRows(it->is_object() ? it->value("loadings", json()) : json(), n);
+  if (loadings) bias.loadings = *loadings;
   parent->Include(fields.status());
-  if (!valid || !IsBias(bias, n)) parent->Fail(name, absl::StrCat("expected loadings of ", n, " rows and a correlation below 1"));
+  if (!loadings || !IsBias(bias, n)) parent->Fail(name, absl::StrCat("expected loadings of ", n, " rows and a correlation below 1"));
   return bias;
 }
 

@@ -35,31 +35,38 @@ TEST(JointModelTest, JacobiansMatchDifferences) {
     ASSERT_EQ(all, n + 3 + 2 + 1);
     const auto scratch = functions->MakeScratch();
     const VectorXd s = RandomVector(&rng, all), u = RandomVector(&rng, c.model.input_size);
-    VectorXd f(all), f_up(all), f_down(all), h(n_y), h_up(n_y), h_down(n_y);
-    MatrixXd F(all, all), H(n_y, all), unused_F(all, all), unused_H(n_y, all);
+    VectorXd f(all), h(n_y);
+    MatrixXd F(all, all), H(n_y, all);
     F.setConstant(7);  // nothing of it is left
     H.setConstant(7);
     joint.Transition(s, u, &f, &F, scratch.get());
     joint.Measurement(s, u, &h, &H, scratch.get());
-    constexpr double kStep = 1e-6;
-    for (Index j = 0; j < all; ++j) {
-      VectorXd up = s, down = s;
-      up[j] += kStep;
-      down[j] -= kStep;
-      joint.Transition(up, u, &f_up, &unused_F, scratch.get());
-      joint.Transition(down, u, &f_down, &unused_F, scratch.get());
-      joint.Measurement(up, u, &h_up, &unused_H, scratch.get());
-      joint.Measurement(down, u, &h_down, &unused_H, scratch.get());
-      EXPECT_LT((F.col(j) - (f_up - f_down) / (2 * kStep)).norm(), 1e-7 * (1 + F.norm())) << j;
-      EXPECT_LT((H.col(j) - (h_up - h_down) / (2 * kStep)).norm(), 1e-7 * (1 + H.norm())) << j;
-    }
+    const auto expect_derivative = [&](const MatrixXd& jacobian, const auto& value_at) {
+      constexpr double kStep = 1e-6;
+      for (Index j = 0; j < all; ++j) {
+        const VectorXd step = kStep * VectorXd::Unit(all, j);
+        const VectorXd up = value_at(s + step), down = value_at(s - step);
+        EXPECT_LT((jacobian.col(j) - (up - down) / (2 * kStep)).norm(), 1e-7 * (1 + jacobian.norm())) << j;
+      }
+    };
+    MatrixXd unused_F(all, all), unused_H(n_y, all);
+    expect_derivative(F, [&](const VectorXd& at) {
+      VectorXd value(all);
+      joint.Transition(at, u, &value, &unused_F, scratch.get());
+      return value;
+    });
+    expect_derivative(H, [&](const VectorXd& at) {
+      VectorXd value(n_y);
+      joint.Measurement(at, u, &value, &unused_H, scratch.get());
+      return value;
+    });
     // With nothing beside the state it is the model's own.
-    VectorXd f_own(n), zero = VectorXd::Zero(all);
+    VectorXd f_own(n), f_zero(all), zero = VectorXd::Zero(all);
     MatrixXd F_own(n, n);
     zero.head(n) = s.head(n);
     functions->Transition(*functions->Prepare(nssm::RandomParameters(model, 5)), s.head(n), u, &f_own, &F_own, scratch.get());
-    joint.Transition(zero, u, &f_up, &unused_F, scratch.get());
-    EXPECT_EQ(f_own, f_up.head(n));
+    joint.Transition(zero, u, &f_zero, &unused_F, scratch.get());
+    EXPECT_EQ(f_own, f_zero.head(n));
     EXPECT_EQ(F_own, unused_F.topLeftCorner(n, n));
     if (c.model.is_case_one()) continue;
     VectorXd kept(all);
@@ -67,14 +74,11 @@ TEST(JointModelTest, JacobiansMatchDifferences) {
     J.setConstant(7);
     joint.Reconstruct(s, u, &kept, &J, scratch.get());
     EXPECT_EQ(kept.tail(all - n), s.tail(all - n));
-    for (Index j = 0; j < all; ++j) {
-      VectorXd up = s, down = s;
-      up[j] += kStep;
-      down[j] -= kStep;
-      joint.Reconstruct(up, u, &f_up, &unused_F, scratch.get());
-      joint.Reconstruct(down, u, &f_down, &unused_F, scratch.get());
-      EXPECT_LT((J.col(j) - (f_up - f_down) / (2 * kStep)).norm(), 1e-7 * (1 + J.norm())) << j;
-    }
+    expect_derivative(J, [&](const VectorXd& at) {
+      VectorXd value(all);
+      joint.Reconstruct(at, u, &value, &unused_F, scratch.get());
+      return value;
+    });
   }
 }
 
