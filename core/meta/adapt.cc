@@ -462,17 +462,30 @@ absl::StatusOr<AdaptationResult> Adapt(const Bundle& bundle, const Trajectory& c
   METAEKF_ASSIGN_OR_RETURN(Trial trial, RunTrial(bundle, problem, head, tail, options, on_trial_step));
   result.after = std::move(trial.errors);
   result.arx = ArxErrors(head, tail, spec.warmup());
-  result.noise = OwnNoise(trial.adapted, TailOf(trial.adapted, context, held_out_from), bundle.noise.log_std, options.executor);
 
   AdaptationOptions whole = options;
   whole.inner_loop.steps = result.steps = trial.steps;
   problem.from = std::move(trial.unknowns);
   problem.tolerance = SystemFitOptions().tolerance;
-  METAEKF_ASSIGN_OR_RETURN(FitResult fit, FitAnyPrecision(bundle, problem, problem.context, whole, on_step));
-  result.parameters = std::move(fit.parameters);
-  result.posterior = std::move(fit.posterior);
-  result.context_loss_before = fit.loss_before;
-  result.context_loss_after = fit.loss_after;
+  const auto find_noise = [&](base::Executor* executor) {
+    result.noise = OwnNoise(trial.adapted, TailOf(trial.adapted, context, held_out_from), bundle.noise.log_std, executor);
+  };
+  absl::StatusOr<FitResult> fit;
+  const auto fit_whole = [&](base::Executor* executor) {
+    whole.executor = executor;
+    fit = FitAnyPrecision(bundle, problem, problem.context, whole, on_step);
+  };
+  if (options.method == AdaptationMethod::kFromScratch) {  // from several starts
+    find_noise(options.executor);
+    fit_whole(options.executor);
+  } else {  // neither keeps more than one thread busy
+    options.executor->ParallelFor(2, [&](size_t i, size_t) { i == 0 ? fit_whole(base::CallingThread()) : find_noise(base::CallingThread()); });
+  }
+  if (!fit.ok()) return fit.status();
+  result.parameters = std::move(fit->parameters);
+  result.posterior = std::move(fit->posterior);
+  result.context_loss_before = fit->loss_before;
+  result.context_loss_after = fit->loss_after;
   return result;
 }
 

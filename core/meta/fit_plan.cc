@@ -46,6 +46,23 @@ struct Candidate {
   double damping = kWarmDamping;
 };
 
+/// A workspace for every thread, made when it is first asked for.
+class Workspaces {
+ public:
+  Workspaces(const RolloutLeastSquares& problem, const nssm::LossShape& shape, const base::Executor& executor)
+      : problem_(problem), shape_(shape), of_slots_(executor.concurrency()) {}
+
+  RolloutLeastSquares::Workspace* Of(size_t slot) {
+    if (!of_slots_[slot]) of_slots_[slot] = std::make_unique<RolloutLeastSquares::Workspace>(problem_, shape_);
+    return of_slots_[slot].get();
+  }
+
+ private:
+  const RolloutLeastSquares& problem_;
+  nssm::LossShape shape_;
+  std::vector<std::unique_ptr<RolloutLeastSquares::Workspace>> of_slots_;
+};
+
 bool Cheaper(const Candidate& a, const Candidate& b) { return a.cost < b.cost; }
 
 }  // namespace
@@ -94,20 +111,20 @@ std::optional<Directions> DirectionsOf(const GaussianPrior& prior) {
 /// The mean and those examples that are the most probable, each with a start c₀ fitted to the first samples.
 absl::StatusOr<std::vector<Candidate>> Screen(const FitPlan& plan, const GaussianPrior& prior, const std::vector<double>& mean,
                                               const Belief& belief, const std::optional<Directions>& directions,
-                                              const Trajectory& normalised) {
+                                              const Trajectory& normalised, base::Executor* executor) {
   METAEKF_ASSIGN_OR_RETURN(const Trajectory head,
                            data::FirstSamples(normalised, std::min(normalised.length(), kScreeningSamples)));
   const RolloutLeastSquares& screened = plan.start ? *plan.start : plan.dynamics;
   METAEKF_ASSIGN_OR_RETURN(const LossData<double> few, screened.Cut(plan.start ? head : normalised));
-  RolloutLeastSquares::Workspace workspace(screened, few.shape);
   const Index adapted = plan.dynamics.adapted_size();
   const VectorXd weights = prior.noise_variance.cwiseInverse();
   const Belief start_belief{.mean = VectorXd::Zero(prior.start.rows()), .precision = prior.start, .noise_variance = prior.noise_variance};
-  std::vector<Candidate> candidates;
-  bool mean_simulates = false;
-  for (Index i = -1; i < prior.examples.cols(); ++i) {
-    Candidate candidate{.unknowns = belief.mean};
-    if (i >= 0) candidate.unknowns.head(adapted) = prior.examples.col(i);
+  Workspaces workspaces(screened, few.shape, *executor);
+  std::vector<Candidate> candidates(1 + static_cast<size_t>(prior.examples.cols()));
+  executor->ParallelFor(candidates.size(), [&](size_t i, size_t slot) {
+    Candidate& candidate = candidates[i];
+    candidate.unknowns = belief.mean;
+    if (i > 0) candidate.unknowns.head(adapted) = prior.examples.col(static_cast<Index>(i) - 1);
     double penalty = Penalty(belief, candidate.unknowns, adapted);
     if (directions) {
       const VectorXd z = CoordinatesNear(belief, directions->basis, candidate.unknowns);
@@ -118,17 +135,16 @@ absl::StatusOr<std::vector<Candidate>> Screen(const FitPlan& plan, const Gaussia
     ScatterAdapted(plan.dynamics, candidate.unknowns, &parameters);
     if (plan.start) {
       const MapFit fit = FitMap(screened, few, parameters, start_belief, start_belief.mean,
-                                {.optimiser = {.max_iterations = kScreeningSteps, .initial_damping = kWarmDamping}}, &workspace);
+                                {.optimiser = {.max_iterations = kScreeningSteps, .initial_damping = kWarmDamping}}, workspaces.Of(slot));
       candidate.unknowns.tail(prior.start.rows()) = fit.unknowns;
       candidate.cost = fit.cost;
     } else {
-      candidate.cost = screened.Cost(parameters.data(), VectorXd(), weights, few, &workspace);
+      candidate.cost = screened.Cost(parameters.data(), VectorXd(), weights, few, workspaces.Of(slot));
     }
     candidate.cost += penalty;
-    if (!std::isfinite(candidate.cost)) continue;
-    mean_simulates = mean_simulates || i < 0;
-    candidates.push_back(std::move(candidate));
-  }
+  });
+  const bool mean_simulates = std::isfinite(candidates[0].cost);
+  std::erase_if(candidates, [](const Candidate& candidate) { return !std::isfinite(candidate.cost); });
   // The mean stays among them: it is rarely near, but the fit from there is the least likely to stall.
   std::stable_sort(candidates.begin() + (mean_simulates ? 1 : 0), candidates.end(), Cheaper);
   if (candidates.size() > kContenders) candidates.resize(kContenders);
@@ -146,7 +162,7 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
   METAEKF_ASSIGN_OR_RETURN(const LossData<double> data, plan.dynamics.Cut(normalised));
   std::vector<Candidate> candidates{{.unknowns = options.from, .damping = kContinuedDamping}};
   if (options.from.size() == 0) {
-    METAEKF_ASSIGN_OR_RETURN(candidates, Screen(plan, prior, mean, belief, directions, normalised));
+    METAEKF_ASSIGN_OR_RETURN(candidates, Screen(plan, prior, mean, belief, directions, normalised, options.executor));
   }
   if (candidates.empty()) {
     return absl::OutOfRangeError("the fit diverged: neither the meta-learned parameters nor any example simulate this system");
@@ -154,11 +170,7 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
   SystemFit result{.parameters = mean};
   FitProgress progress(on_step);
   const OnIteration tell = [&progress](int step, double cost, const VectorXd&) { return progress.Tell(step, cost); };
-  std::vector<std::unique_ptr<RolloutLeastSquares::Workspace>> workspaces(options.executor->concurrency());
-  const auto workspace = [&](size_t slot) {
-    if (!workspaces[slot]) workspaces[slot] = std::make_unique<RolloutLeastSquares::Workspace>(plan.dynamics, data.shape);
-    return workspaces[slot].get();
-  };
+  Workspaces workspaces(plan.dynamics, data.shape, *options.executor);
   if (candidates.size() > 1) {
     options.executor->ParallelFor(candidates.size(), [&](size_t i, size_t slot) {
       if (progress.stopped()) return;
@@ -166,7 +178,7 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
                                 {.optimiser = {.max_iterations = std::min(kContenderSteps, options.steps),
                                                .tolerance = kContenderTolerance},
                                  .directions = directions},
-                                workspace(slot), tell);
+                                workspaces.Of(slot), tell);
       candidates[i] = {fit.cost, fit.unknowns, fit.damping};
     });
     std::stable_sort(candidates.begin(), candidates.end(), Cheaper);
@@ -177,7 +189,7 @@ absl::StatusOr<SystemFit> FitSystem(const FitPlan& plan, const GaussianPrior& pr
                                      .initial_damping = candidates[0].damping},
                        .noise_samples = options.noise_samples,
                        .directions = directions},
-                      workspace(0), tell);
+                      workspaces.Of(0), tell);
   if (directions) {
     result.fit.unknowns.head(prior.loadings.rows()) =
         nssm::AlongLoadings(prior, belief.mean.head(prior.loadings.rows()), result.fit.coordinates.head(prior.loadings.cols()));
