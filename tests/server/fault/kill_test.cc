@@ -1,12 +1,12 @@
 // kill -9 of the server at seeded moments of training, adaptation and upload: it starts again,
-// every model listed loads, nothing half made is listed, and the job goes on.
+// every model listed loads, nothing half made is listed, and the job goes on. A moment is a number of changes in the data
+// directory: kills hit where something is being written, and a slow machine gets as far as a quick one.
 
-#include <chrono>
 #include <functional>
 #include <thread>
 
-#include "absl/synchronization/mutex.h"
 #include "core/base/rng.h"
+#include "tests/server/support/directory_changes.h"
 #include "tests/server/support/server_process.h"
 #include "tests/server/support/server_test.h"
 #include "tests/server/support/tiny_models.h"
@@ -18,35 +18,23 @@ using ::testing::IsEmpty;
 using ::testing::SizeIs;
 
 constexpr int kRounds = 20;
-constexpr int kPieces = 3;  // what may be under way when the kill comes: the first, second or third
+// Changes within which a kill comes: several uploads, adaptations or checkpoints.
+constexpr uint64_t kUploadChanges = 60, kAdaptationChanges = 80, kTrainingChanges = 30;
 
 class KillTest : public testing::Test {
  protected:
-  /// Starts a server, repeats `piece` against it, and kills it `delay` after `pieces` of them were confirmed; returns
-  /// how many were in the end. What is waited for are the pieces, so that a slow machine gets as far as a quick one.
-  int KillAfter(int pieces, std::chrono::microseconds delay, const std::function<bool(Client&)>& piece) {
+  /// Starts a server, repeats `piece` against it, and kills it after so many changes; returns how many pieces were confirmed.
+  int KillAfter(size_t changes, const std::function<bool(Client&)>& piece) {
     ServerProcess server(directory_.path(), config_);
     EXPECT_NE(server.address(), "") << "the server did not start";
     if (HasFailure()) return 0;
     Client client(server.address());
-    absl::Mutex mutex;
+    DirectoryChanges seen(directory_.path());
     int confirmed = 0;
-    bool ended = false;
     std::thread worker([&] {
-      while (piece(client)) {
-        absl::MutexLock lock(&mutex);
-        ++confirmed;
-      }
-      absl::MutexLock lock(&mutex);
-      ended = true;
+      while (piece(client)) ++confirmed;
     });
-    {
-      const auto far_enough = [&] { return confirmed >= pieces || ended; };
-      absl::MutexLock lock(&mutex, absl::Condition(&far_enough));
-      EXPECT_FALSE(ended) << "a piece failed before the kill";
-    }
-    // From here on the moment of death is what varies, so there is no event to wait for.
-    std::this_thread::sleep_for(delay);
+    EXPECT_TRUE(seen.Wait(changes)) << "the pieces came to an end before the kill";
     EXPECT_EQ(server.End(SIGKILL).signal, SIGKILL);
     worker.join();
     return confirmed;
@@ -61,12 +49,6 @@ class KillTest : public testing::Test {
       work(client);
     }
     EXPECT_EQ(server.End(SIGTERM).code, 0);
-  }
-
-  static std::chrono::microseconds TimeOf(const std::function<void()>& work) {
-    const auto start = std::chrono::steady_clock::now();
-    work();
-    return std::chrono::duration_cast<std::chrono::microseconds>(std::chrono::steady_clock::now() - start);
   }
 
   /// Everything that is listed is whole: files match their digests, models load and predict.
@@ -120,12 +102,11 @@ TEST_F(KillTest, TrainingGoesOnAfterEachOfTwentyKills) {
   base::Rng rng(2025);
   for (int round = 0; round < kRounds && !HasFailure(); ++round) {
     SCOPED_TRACE(round);
-    const std::chrono::microseconds delay(20'000 + rng.Index(200'000));
     ServerProcess server(directory_.path(), config_);
     ASSERT_NE(server.address(), "") << "the server did not start";
     Client client(server.address());
     CheckEverything(client);
-    std::this_thread::sleep_for(delay);
+    EXPECT_TRUE(DirectoryChanges(directory_.path()).Wait(1 + rng.Index(kTrainingChanges)));
     EXPECT_EQ(server.End(SIGKILL).signal, SIGKILL);
   }
   // It is still the first job, further on than any server left it in the meantime.
@@ -143,19 +124,15 @@ TEST_F(KillTest, TrainingGoesOnAfterEachOfTwentyKills) {
 }
 
 TEST_F(KillTest, NothingHalfMadeIsListedAfterKillsDuringUploads) {
-  std::chrono::microseconds one_upload{};
   int confirmed = 0;
   WithServer([&](Client& client) {
-    const std::string file = nssm::WriteModelFile(TinyBundle(0));
-    one_upload = TimeOf([&] { ASSERT_TRUE(client.Import(ImportRequests("robot", file, 500)).ok()); });
+    ASSERT_TRUE(client.Import(ImportRequests("robot", nssm::WriteModelFile(TinyBundle(0)), 500)).ok());
     ++confirmed;
   });
   base::Rng rng(2026);
   for (int round = 0; round < kRounds && !HasFailure(); ++round) {
     SCOPED_TRACE(round);
-    const int pieces = static_cast<int>(rng.Index(kPieces));
-    const auto delay = one_upload * rng.Index(100) / 100;
-    confirmed += KillAfter(pieces, delay, [seed = 0](Client& client) mutable {
+    confirmed += KillAfter(1 + rng.Index(kUploadChanges), [seed = 0](Client& client) mutable {
       return client.Import(ImportRequests("robot", nssm::WriteModelFile(TinyBundle(++seed)), 500)).ok();
     });
     WithServer([&](Client& survivor) {
@@ -173,19 +150,16 @@ TEST_F(KillTest, NothingHalfMadeIsListedAfterKillsDuringAdaptations) {
   std::vector<v1::AdaptRequest> requests(2);
   requests[0].mutable_options()->set_model("models/robot");
   *requests[1].mutable_samples() = TinyContext(60);
-  std::chrono::microseconds one_adaptation{};
   int confirmed = 0;
   WithServer([&](Client& client) {
     ASSERT_TRUE(client.Import(ImportRequests("robot", nssm::WriteModelFile(TinyBundle()))).ok());
-    one_adaptation = TimeOf([&] { ASSERT_TRUE(client.Adapt(requests).ok()); });
+    ASSERT_TRUE(client.Adapt(requests).ok());
     ++confirmed;
   });
   base::Rng rng(2027);
   for (int round = 0; round < kRounds && !HasFailure(); ++round) {
     SCOPED_TRACE(round);
-    const int pieces = static_cast<int>(rng.Index(kPieces));
-    const auto delay = one_adaptation * rng.Index(100) / 100;
-    confirmed += KillAfter(pieces, delay, [&](Client& client) { return client.Adapt(requests).ok(); });
+    confirmed += KillAfter(1 + rng.Index(kAdaptationChanges), [&](Client& client) { return client.Adapt(requests).ok(); });
     WithServer([&](Client& survivor) {
       CheckEverything(survivor);
       v1::ListAdaptationsRequest list;
