@@ -8,6 +8,8 @@
 
 #include "core/base/executor.h"
 #include "core/data/split.h"
+#include "core/experiments/filter_run.h"
+#include "core/experiments/localization_data.h"
 #include "core/meta/adapt.h"
 #include "core/nssm/model_file.h"
 #include "core/nssm/predict.h"
@@ -97,6 +99,31 @@ TEST(ZooTest, VanDerPolAdaptsToFourHundredSamples) {
   for (uint64_t seed = 4242; seed < 4249; ++seed) errors.push_back(AdaptedVanDerPol(seed));
   std::sort(errors.begin(), errors.end());
   EXPECT_LT(errors[errors.size() / 2], 1000);
+}
+
+/// Of vehicles that the model has not seen, adapted to the first 8 s of a drive: Σ ‖x̂ − x‖ over the 32 s that follow, the median, and the
+/// share of the states within bounds of 95 %.
+TEST(ZooTest, LocalizationFollowsVehiclesAndSaysHowWell) {
+  const auto bundle = nssm::ReadModelFile(Contents(kZoo + "/localization.safetensors"));
+  ASSERT_TRUE(bundle.ok()) << bundle.status();
+  const std::shared_ptr<const filter::FilterModel> functions = filter::FilterModel::Create(*bundle);
+  const auto executor = base::MakeThreadExecutor(1);
+  const sim::Fleet fleet = *experiments::Vehicles(15, 4242, executor.get());
+  std::vector<double> errors;
+  double held = 0;
+  for (const Trajectory& vehicle : fleet.dataset.trajectories) {
+    const auto adapted = experiments::AdaptForFilter(*bundle, vehicle, experiments::kLocalizationContext);
+    ASSERT_TRUE(adapted.ok()) << adapted.status();
+    const auto run = experiments::FilterAfterContext(*adapted, functions, vehicle, experiments::kLocalizationContext);
+    ASSERT_TRUE(run.ok()) << run.status();
+    const Eigen::MatrixXd off = experiments::StateErrors(run->means, vehicle.states.rightCols(run->means.cols()));
+    errors.push_back(experiments::SummedError(off));
+    held += experiments::Coverage(*run, off, 1.96) / static_cast<double>(fleet.dataset.trajectories.size());
+  }
+  std::sort(errors.begin(), errors.end());
+  EXPECT_LT(errors[errors.size() / 2], 208.0 / 3);  // 208: dead reckoning with the true geometry (core/experiments/README.md)
+  EXPECT_GT(held, 0.9);
+  EXPECT_LT(held, 0.99);
 }
 
 }  // namespace
