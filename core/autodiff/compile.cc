@@ -3,15 +3,17 @@
 #include <map>
 
 #include "core/autodiff/arena_allocator.h"
+#include "core/autodiff/merge_products.h"
 #include "core/autodiff/program.h"
 #include "core/autodiff/uses.h"
+#include "core/linalg/products.h"
 
 namespace metaekf::autodiff {
 namespace {
 
 int64_t SizeOf(const Node& node) { return int64_t{node.rows} * node.cols; }
 
-bool IsView(Op op) { return op == Op::kSliceRows || op == Op::kTile || op == Op::kCollect || op == Op::kFinalCarry; }
+bool IsView(Op op) { return op == Op::kSliceRows || op == Op::kSliceCols || op == Op::kTile || op == Op::kCollect || op == Op::kFinalCarry; }
 
 Operand Tiled(Operand operand, const Node& tile) {
   operand.tile_width = tile.width;
@@ -281,6 +283,17 @@ class Compiler {
         }
         return;
       }
+      case Op::kConcatCols: {
+        for (const Value part : node.inputs) {
+          EmitCopy(list, out, at(part), graph.node(part));
+          out.offset += int64_t{out.ld} * graph.node(part).cols;
+        }
+        return;
+      }
+      case Op::kSliceCols:
+        i.op = Opcode::kCopy;
+        i.a.offset += int64_t{i.a.ld} * node.first;
+        break;
       case Op::kSliceRows:
         i.op = Opcode::kSliceRows;
         i.first = node.first;
@@ -322,6 +335,7 @@ class Compiler {
     if (uses_->in_place[static_cast<size_t>(v)]) {
       where = place(node.inputs[0]);
       if (node.op == Op::kSliceRows) where.offset += node.first;
+      if (node.op == Op::kSliceCols) where.offset += int64_t{where.ld} * node.first;
       if (node.op == Op::kTile) where = Tiled(where, node);
       return;
     }
@@ -448,10 +462,25 @@ class Compiler {
     for (const auto& [written, out] : carry_copies) {
       EmitCopy(&loop.instructions, written, at[static_cast<size_t>(out)], body.node(out));
     }
+    for (Instruction& i : loop.instructions) {
+      if (WantsPanel(i, loop)) i.panel = Allocate(scratch, linalg::PanelSize(i.rows, i.inner));
+    }
     program_.instructions.push_back(
         {.op = Opcode::kLoop, .loop = static_cast<int32_t>(program_.loops.size())});
     program_.loops.push_back(std::move(loop));
     Release(scratch);
+  }
+
+  /// Whether a product in a loop is small and its first factor the same at every step.
+  static bool WantsPanel(const Instruction& i, const Loop& loop) {
+    constexpr int32_t kMostColumns = 8, kMostElements = 4096;
+    if (i.op != Opcode::kMatMul && i.op != Opcode::kMatMulAdd) return false;
+    if (i.transpose_b || i.cols > kMostColumns || i.rows * i.inner > kMostElements) return false;
+    if (i.a.step_stride != 0 || i.a.tile_width != 0 || i.b.tile_width != 0) return false;
+    return std::none_of(loop.instructions.begin(), loop.instructions.end(), [&](const Instruction& other) {
+      return other.out.slot == i.a.slot && i.a.offset >= other.out.offset &&
+             i.a.offset < other.out.offset + int64_t{other.out.ld} * other.cols;
+    });
   }
 
   /// Notes where the outer graph finds a body value of all steps.
@@ -478,6 +507,9 @@ class Compiler {
 
 }  // namespace
 
-Program Compile(const Graph& graph, const std::vector<Output>& outputs) { return Compiler(graph, outputs).Run(); }
+Program Compile(const Graph& graph, const std::vector<Output>& outputs) {
+  const std::optional<MergedGraph> merged = MergeProducts(graph, outputs);
+  return merged ? Compiler(merged->graph, merged->outputs).Run() : Compiler(graph, outputs).Run();
+}
 
 }  // namespace metaekf::autodiff

@@ -149,6 +149,10 @@ class ForwardMode {
   Value Rule(Value v, const Node& node) {
     const auto t = [&](size_t i) { return tangent(node.inputs[i]); };
     switch (node.op) {
+      case Op::kConcatCols:
+      case Op::kSliceCols:
+        assert(false);  // made after differentiation
+        return kNoValue;
       case Op::kInput:
       case Op::kConstant:
         return kNoValue;
@@ -307,6 +311,10 @@ class ReverseMode {
   void Rule(const Node& node, Value g) {
     const auto in = [&](size_t i) { return node.inputs[i]; };
     switch (node.op) {
+      case Op::kConcatCols:
+      case Op::kSliceCols:
+        assert(false);  // made after differentiation
+        return;
       case Op::kInput:
       case Op::kConstant:
       case Op::kScan:

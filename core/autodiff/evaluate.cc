@@ -28,6 +28,9 @@ class Machine {
         continue;
       }
       const Loop& loop = program_.loops[static_cast<size_t>(i.loop)];
+      for (const Instruction& inner : loop.instructions) {
+        if (inner.panel >= 0) linalg::MakePanel(inner.transpose_a, inner.rows, inner.inner, At(inner.a, 0), inner.a.ld, arena_ + inner.panel);
+      }
       for (int64_t step = 0; step < loop.length; ++step) {
         const int64_t t = loop.reverse ? loop.length - 1 - step : step;
         for (const Instruction& inner : loop.instructions) Execute(inner, t);
@@ -89,6 +92,10 @@ class Machine {
                    accumulate);
   }
 
+  void PanelProduct(const Instruction& i, int64_t t, const T* addend, int32_t ld) const {
+    linalg::PanelProduct(i.rows, i.cols, i.inner, arena_ + i.panel, At(i.b, t), i.b.ld, addend, ld, At(i.out, t), i.out.ld);
+  }
+
   void Execute(const Instruction& i, int64_t t) const {
     switch (i.op) {
       case Opcode::kCopy:
@@ -99,10 +106,11 @@ class Machine {
         return;
       }
       case Opcode::kMatMul:
-        return Product(i, t, false);
+        return i.panel >= 0 ? PanelProduct(i, t, nullptr, 0) : Product(i, t, false);
       case Opcode::kMatMulAdd:
+        if (i.panel >= 0 && i.c.tile_width == 0) return PanelProduct(i, t, At(i.c, t), i.c.ld);
         Copy(i, i.c, t);
-        return Product(i, t, true);
+        return i.panel >= 0 ? PanelProduct(i, t, At(i.out, t), i.out.ld) : Product(i, t, true);
       case Opcode::kAdd:
         return Binary(i, t, [](T a, T b) { return a + b; });
       case Opcode::kSub:
@@ -222,10 +230,10 @@ Executable<T>::Executable(Program program) : program_(std::move(program)), const
 }
 
 template <typename T>
-Arena<T>::Arena(std::initializer_list<const Executable<T>*> users)
-    : memory_(std::max(users, [](const Executable<T>* a, const Executable<T>* b) {
+Arena<T>::Arena(const std::vector<const Executable<T>*>& users)
+    : memory_((*std::max_element(users.begin(), users.end(), [](const Executable<T>* a, const Executable<T>* b) {
                 return a->program().arena_size < b->program().arena_size;
-              })->program().arena_size) {}
+              }))->program().arena_size) {}
 
 template <typename T>
 void Evaluate(const Executable<T>& executable, const Slots<T>& slots, const Arena<T>& arena) {

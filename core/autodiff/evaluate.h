@@ -2,8 +2,8 @@
 
 #include <array>
 #include <cstddef>
-#include <initializer_list>
 #include <memory>
+#include <vector>
 
 #include "core/autodiff/program.h"
 
@@ -41,7 +41,7 @@ class Executable {
 template <typename T>
 class Arena {
  public:
-  explicit Arena(std::initializer_list<const Executable<T>*> users);
+  explicit Arena(const std::vector<const Executable<T>*>& users);
   T* data() const { return memory_.data(); }
 
  private:

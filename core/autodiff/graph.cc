@@ -179,6 +179,17 @@ Value Graph::PadRows(Value a, int32_t first, int32_t rows) {
   return Append({.op = Op::kPadRows, .rows = rows, .cols = operand.cols, .inputs = {a}, .first = first});
 }
 
+Value Graph::ConcatCols(const std::vector<Value>& parts) {
+  int32_t cols = 0;
+  for (const Value part : parts) cols += node(part).cols;
+  return Append({.op = Op::kConcatCols, .rows = node(parts.front()).rows, .cols = cols, .inputs = parts});
+}
+
+Value Graph::SliceCols(Value a, int32_t first, int32_t cols) {
+  assert(first + cols <= node(a).cols);
+  return Append({.op = Op::kSliceCols, .rows = node(a).rows, .cols = cols, .inputs = {a}, .first = first});
+}
+
 Value Graph::AddOrEither(Value a, Value b) {
   if (a == kNoValue) return b;
   if (b == kNoValue) return a;

@@ -30,6 +30,8 @@ enum class Op : uint8_t {
   kConcatRows,  // [A; B; …]
   kSliceRows,   // rows first … first + rows − 1 of A
   kPadRows,     // A as rows first … of a matrix of zeros
+  kConcatCols,  // [A B …]; this and the next are what MergeProducts makes, and have no derivatives
+  kSliceCols,   // columns first … first + cols − 1 of A
   kScan,        // a recurrence; see Scan. Its values are read by the two operations below
   kCollect,     // body value `index` of every step, side by side: n × (T·w)
   kFinalCarry,  // carry `index` after the last step
@@ -46,7 +48,7 @@ struct Node {
   int32_t order = 0;   // of an activation's derivative
   int32_t width = 0;   // of a tile
   int32_t count = 0;   // of tiles
-  int32_t first = 0;   // row of a slice or pad
+  int32_t first = 0;   // row, or column, of a slice or pad
   int32_t slot = -1;   // of an input
   int64_t offset = 0;  // of an input, elements from the slot's start
   int32_t index = -1;  // of a collected body value or a final carry
@@ -98,6 +100,8 @@ class Graph {
   Value ConcatRows(const std::vector<Value>& parts);
   Value SliceRows(Value a, int32_t first, int32_t rows);
   Value PadRows(Value a, int32_t first, int32_t rows);
+  Value ConcatCols(const std::vector<Value>& parts);
+  Value SliceCols(Value a, int32_t first, int32_t cols);
   /// a + b where either may be absent (kNoValue, standing for zero).
   Value AddOrEither(Value a, Value b);
   /// a with a column of biases added to each of its columns.

@@ -49,6 +49,7 @@ struct Instruction {
   int32_t first = 0;
   int32_t width = 0, count = 0;  ///< of summed tiles
   int32_t loop = -1;
+  int64_t panel = -1;          ///< of a product in a loop whose `a` stays the same: where in the arena it may be laid out for that
   double scalar = 0;
   Operand out, a, b, c;
 };

@@ -32,6 +32,7 @@ Uses::Uses(const Graph& graph, const std::vector<bool>& needed, const std::vecto
     if (!needed[i]) continue;
     const Node& node = graph.node(v);
     if (node.op == Op::kSliceRows) in_place[i] = only_products[i] && !kept[i];
+    if (node.op == Op::kSliceCols) in_place[i] = !kept[i];
     if (node.op == Op::kTile) in_place[i] = only_elementwise[i] && !kept[i];
     if (node.op == Op::kCollect || node.op == Op::kFinalCarry) in_place[i] = true;
   }

@@ -1,6 +1,9 @@
 #include "core/base/executor.h"
 
+#include <atomic>
+#include <chrono>
 #include <condition_variable>
+#include <cstdint>
 #include <mutex>
 #include <thread>
 #include <vector>
@@ -15,6 +18,17 @@ class SerialExecutor : public Executor {
   }
   size_t concurrency() const override { return 1; }
 };
+
+/// How long a thread looks for what it waits for before it sleeps. To wake one takes some 50 µs, as long as a piece of a gradient of
+/// which there are many, one after the other.
+constexpr std::chrono::microseconds kSpin(50);
+
+template <typename Condition>
+void SpinUntil(const Condition& condition) {
+  const auto end = std::chrono::steady_clock::now() + kSpin;
+  while (!condition() && std::chrono::steady_clock::now() < end) {
+  }
+}
 
 class ThreadExecutor : public Executor {
  public:
@@ -40,8 +54,13 @@ class ThreadExecutor : public Executor {
     work_ = &work;
     next_ = 0;
     count_ = count;
+    idle_ = false;
+    ++batches_;
     work_ready_.notify_all();
     Drain(lock, 0);
+    lock.unlock();
+    SpinUntil([this] { return idle_.load(); });
+    lock.lock();
     batch_done_.wait(lock, [this] { return busy_ == 0; });
     work_ = nullptr;
   }
@@ -58,7 +77,10 @@ class ThreadExecutor : public Executor {
       lock.unlock();
       (*work)(index, slot);
       lock.lock();
-      if (--busy_ == 0) batch_done_.notify_one();
+      if (--busy_ == 0 && next_ == count_) {
+        idle_ = true;
+        batch_done_.notify_one();
+      }
     }
   }
 
@@ -68,6 +90,10 @@ class ThreadExecutor : public Executor {
       work_ready_.wait(lock, [this] { return stopping_ || next_ < count_; });
       if (stopping_) return;
       Drain(lock, slot);
+      const uint64_t last = batches_;
+      lock.unlock();
+      SpinUntil([this, last] { return batches_.load() != last; });
+      lock.lock();
     }
   }
 
@@ -80,6 +106,9 @@ class ThreadExecutor : public Executor {
   size_t count_ = 0;
   size_t busy_ = 0;
   bool stopping_ = false;
+  // What spinning threads look at; written with the mutex held.
+  std::atomic<uint64_t> batches_ = 0;
+  std::atomic<bool> idle_ = true;
   std::vector<std::thread> helpers_;
 };
 

@@ -13,6 +13,14 @@
 #include <cstring>
 #include <type_traits>
 
+#ifndef METAEKF_PANEL_HEIGHT  // once, not for each instruction set
+#define METAEKF_PANEL_HEIGHT
+namespace metaekf::linalg {
+/// Rows of a panel for m rows of a factor: whole vectors of any instruction set.
+constexpr ptrdiff_t PanelHeight(int32_t m) { return (ptrdiff_t{m} + 15) / 16 * 16; }
+}  // namespace metaekf::linalg
+#endif
+
 // Sums stay in registers only where the loops over them are unrolled.
 #undef METAEKF_UNROLL
 #ifdef __clang__
@@ -268,6 +276,22 @@ void Dots(D d, int m, int n, int k, const T* a, ptrdiff_t lda, const T* b, ptrdi
   if (n == 1) return DotColumns<1>(d, m, k, a, lda, b, ldb, c);
 }
 
+/// C = A Bᵀ of few rows and many columns, as a gradient of a small layer's weights over many samples: as Cᵀ = B Aᵀ, where a column of B
+/// fills vectors.
+template <class D, typename T = hn::TFromD<D>>
+void AsTranspose(D d, int m, int n, int k, const T* a, ptrdiff_t lda, const T* b, ptrdiff_t ldb, Target<T> c) {
+  constexpr int kRows = 64;
+  HWY_ALIGN T buffer[kRows * hn::MaxLanes(D())];
+  for (int row = 0; row < n; row += kRows) {
+    const int rows = std::min(kRows, n - row);
+    Panels(d, rows, m, k, Strided<T>{b + row, 1, ldb}, Strided<T>{a, lda, 1}, Target<T>{buffer, kRows, false});
+    for (int j = 0; j < rows; ++j) {
+      T* to = c.at + (row + j) * c.ld;
+      for (int i = 0; i < m; ++i) to[i] = c.accumulate ? to[i] + buffer[i * kRows + j] : buffer[i * kRows + j];
+    }
+  }
+}
+
 template <typename T>
 void Product(bool transpose_a, bool transpose_b, int m, int n, int k, const T* a, int lda, const T* b, int ldb, T* c, int ldc,
              bool accumulate) {
@@ -277,6 +301,7 @@ void Product(bool transpose_a, bool transpose_b, int m, int n, int k, const T* a
   if (transpose_a && !transpose_b && (n <= kDotMaxColumns || 2 * m < lanes) && k >= kDotMinDepthVectors * lanes) {
     return Dots(d, m, n, k, a, lda, b, ldb, to);
   }
+  if (!transpose_a && transpose_b && m < lanes && n >= lanes) return AsTranspose(d, m, n, k, a, lda, b, ldb, to);
   const Strided<T> by_a = transpose_a ? Strided<T>{a, lda, 1} : Strided<T>{a, 1, lda};
   const Strided<T> by_b = transpose_b ? Strided<T>{b, ldb, 1} : Strided<T>{b, 1, ldb};
   Panels(d, m, n, k, by_a, by_b, to);
@@ -291,6 +316,67 @@ void DoubleProduct(bool transpose_a, bool transpose_b, int m, int n, int k, cons
   Product(transpose_a, transpose_b, m, n, k, a, lda, b, ldb, c, ldc, accumulate);
 }
 
+/// kVectors vectors of one column of C. What each element is does not depend on kVectors.
+template <int kVectors, class D, typename T = hn::TFromD<D>>
+HWY_INLINE void PanelColumn(D d, int rows, int k, const T* HWY_RESTRICT panel, ptrdiff_t height, const T* HWY_RESTRICT b,
+                            const T* addend, T* c) {
+  const int lanes = static_cast<int>(hn::Lanes(d));
+  // Two sums of each: a single one would wait for itself.
+  hn::Vec<D> sums[2][kVectors];
+  METAEKF_UNROLL
+  for (int i = 0; i < kVectors; ++i) sums[0][i] = sums[1][i] = hn::Zero(d);
+  int l = 0;
+  for (; l + 2 <= k; l += 2, panel += 2 * height) {
+    const auto even = hn::Set(d, b[l]), odd = hn::Set(d, b[l + 1]);
+    METAEKF_UNROLL
+    for (int i = 0; i < kVectors; ++i) {
+      sums[0][i] = hn::MulAdd(hn::Load(d, panel + i * lanes), even, sums[0][i]);
+      sums[1][i] = hn::MulAdd(hn::Load(d, panel + height + i * lanes), odd, sums[1][i]);
+    }
+  }
+  if (l < k) {
+    METAEKF_UNROLL
+    for (int i = 0; i < kVectors; ++i) sums[0][i] = hn::MulAdd(hn::Load(d, panel + i * lanes), hn::Set(d, b[l]), sums[0][i]);
+  }
+  METAEKF_UNROLL
+  for (int i = 0; i < kVectors; ++i, rows -= lanes, c += lanes) {
+    const auto sum = hn::Add(sums[0][i], sums[1][i]);
+    if (rows >= lanes) {
+      hn::StoreU(addend == nullptr ? sum : hn::Add(hn::LoadU(d, addend), sum), d, c);
+    } else {
+      HWY_ALIGN T buffer[hn::MaxLanes(D())];
+      hn::Store(sum, d, buffer);
+      for (int r = 0; r < rows; ++r) c[r] = addend == nullptr ? buffer[r] : addend[r] + buffer[r];
+    }
+    if (addend != nullptr) addend += lanes;
+  }
+}
+
+template <typename T>
+HWY_INLINE void ProductOfPanel(int m, int n, int k, const T* panel, const T* b, ptrdiff_t ldb, const T* addend, ptrdiff_t ldd, T* c, ptrdiff_t ldc) {
+  const hn::ScalableTag<T> d;
+  const hn::CappedTag<T, 4> narrow;
+  const int lanes = static_cast<int>(hn::Lanes(d));
+  const ptrdiff_t height = PanelHeight(m);
+  for (int j = 0; j < n; ++j, b += ldb, c += ldc) {
+    int row = 0;
+    for (; m - row > lanes; row += 2 * lanes) PanelColumn<2>(d, m - row, k, panel + row, height, b, addend ? addend + row : nullptr, c + row);
+    if (m - row > static_cast<int>(hn::Lanes(narrow))) {
+      PanelColumn<1>(d, m - row, k, panel + row, height, b, addend ? addend + row : nullptr, c + row);
+    } else if (row < m) {
+      PanelColumn<1>(narrow, m - row, k, panel + row, height, b, addend ? addend + row : nullptr, c + row);
+    }
+    if (addend != nullptr) addend += ldd;
+  }
+}
+
+void FloatPanelProduct(int m, int n, int k, const float* panel, const float* b, int ldb, const float* d, int ldd, float* c, int ldc) {
+  ProductOfPanel(m, n, k, panel, b, ldb, d, ldd, c, ldc);
+}
+void DoublePanelProduct(int m, int n, int k, const double* panel, const double* b, int ldb, const double* d, int ldd, double* c, int ldc) {
+  ProductOfPanel(m, n, k, panel, b, ldb, d, ldd, c, ldc);
+}
+
 }  // namespace HWY_NAMESPACE
 }  // namespace metaekf::linalg
 HWY_AFTER_NAMESPACE();
@@ -300,6 +386,8 @@ namespace metaekf::linalg {
 
 HWY_EXPORT(FloatProduct);
 HWY_EXPORT(DoubleProduct);
+HWY_EXPORT(FloatPanelProduct);
+HWY_EXPORT(DoublePanelProduct);
 
 namespace {
 
@@ -357,6 +445,29 @@ void MatMul(bool transpose_a, bool transpose_b, int32_t m, int32_t n, int32_t k,
 
 template void MatMul(bool, bool, int32_t, int32_t, int32_t, const float*, int32_t, const float*, int32_t, float*, int32_t, bool);
 template void MatMul(bool, bool, int32_t, int32_t, int32_t, const double*, int32_t, const double*, int32_t, double*, int32_t, bool);
+
+template <typename T>
+void MakePanel(bool transpose_a, int32_t m, int32_t k, const T* a, int32_t lda, T* panel) {
+  for (int32_t l = 0; l < k; ++l, panel += PanelHeight(m)) {
+    std::fill_n(panel, PanelHeight(m), T(0));
+    for (int32_t i = 0; i < m; ++i) panel[i] = transpose_a ? a[l + ptrdiff_t{i} * lda] : a[i + ptrdiff_t{l} * lda];
+  }
+}
+template void MakePanel(bool, int32_t, int32_t, const float*, int32_t, float*);
+template void MakePanel(bool, int32_t, int32_t, const double*, int32_t, double*);
+
+int64_t PanelSize(int32_t m, int32_t k) { return int64_t{PanelHeight(m)} * k; }
+
+template <typename T>
+void PanelProduct(int32_t m, int32_t n, int32_t k, const T* panel, const T* b, int32_t ldb, const T* d, int32_t ldd, T* c, int32_t ldc) {
+  if constexpr (sizeof(T) == sizeof(float)) {
+    HWY_DYNAMIC_DISPATCH(FloatPanelProduct)(m, n, k, panel, b, ldb, d, ldd, c, ldc);
+  } else {
+    HWY_DYNAMIC_DISPATCH(DoublePanelProduct)(m, n, k, panel, b, ldb, d, ldd, c, ldc);
+  }
+}
+template void PanelProduct(int32_t, int32_t, int32_t, const float*, const float*, int32_t, const float*, int32_t, float*, int32_t);
+template void PanelProduct(int32_t, int32_t, int32_t, const double*, const double*, int32_t, const double*, int32_t, double*, int32_t);
 
 void AddSquare(int32_t m, int32_t k, const double* a, int32_t lda, double* c, int32_t ldc) {
   constexpr int32_t kWidth = 48;

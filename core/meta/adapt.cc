@@ -118,7 +118,7 @@ absl::StatusOr<FitResult> Fit(const Bundle& bundle, nssm::LossSpec loss, double 
     METAEKF_ASSIGN_OR_RETURN(shape, nssm::ShapeOfLoss(spec, loss, context.length()));
   }
   const LossFunction<T> function(bundle.model, loss, shape, mask, mask);
-  const auto scratch = function.MakeScratch();
+  auto scratch = function.MakeScratch(options.executor);
   const LossData<T> data = nssm::CutLossData<T>(spec, loss, context, 0, shape);
   FitResult result;
   result.parameters = options.method == AdaptationMethod::kFromScratch ? bundle.model.InitialParameters(options.seed)
@@ -128,8 +128,8 @@ absl::StatusOr<FitResult> Fit(const Bundle& bundle, nssm::LossSpec loss, double 
   GradientSteps stepper(options, bundle.model.layout(), pull, result.parameters);
   const int32_t steps = options.inner_loop.steps;
   for (int32_t step = 0; step <= steps; ++step) {
-    const double value = step < steps ? function.Gradient(typed.data(), data, typed_gradient.data(), scratch)
-                                      : function.Value(typed.data(), data, scratch);
+    const double value = step < steps ? function.Gradient(typed.data(), data, typed_gradient.data(), &scratch)
+                                      : function.Value(typed.data(), data, &scratch);
     if (!std::isfinite(value)) return Diverged(step, value, options.inner_loop.learning_rate);
     (step == 0 ? result.loss_before : result.loss_after) = value;
     if (step > 0 && on_step && !on_step({.step = step, .steps = steps, .loss = value})) return absl::CancelledError("the adaptation was cancelled");

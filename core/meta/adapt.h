@@ -29,7 +29,7 @@ struct AdaptationOptions {
   AdaptationMethod method = AdaptationMethod::kGradientDescent;
   InnerLoopSpec inner_loop;
   uint64_t seed = 0;  ///< of the random initialisation
-  base::Executor* executor = base::CallingThread();  ///< runs starts that compete; changes no result
+  base::Executor* executor = base::CallingThread();  ///< runs starts that compete, and gradients of large models; changes no result
 };
 
 /// What `adapt` does with a model unless told otherwise. Without a method: what its training specification says. The

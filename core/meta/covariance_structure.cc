@@ -49,7 +49,7 @@ double UpdateDiagonal(const MatrixXd& second_moment, FactorModel* model) {
   return largest;
 }
 
-MatrixXd BlockDiagonal(const Pieces& tensors, const MatrixXd& matrix) {
+MatrixXd BlockDiagonal(const nn::Pieces& tensors, const MatrixXd& matrix) {
   MatrixXd blocks = MatrixXd::Zero(matrix.rows(), matrix.cols());
   Index from = 0;
   for (const auto& [offset, size] : tensors) {
@@ -87,7 +87,7 @@ FactorModel FitFactors(const MatrixXd& second_moment, Index rank, const FactorOp
   return model;
 }
 
-StructuredCovariance FitStructure(const GaussianPriorSpec& spec, const Pieces& tensors, const MatrixXd& second_moment) {
+StructuredCovariance FitStructure(const GaussianPriorSpec& spec, const nn::Pieces& tensors, const MatrixXd& second_moment) {
   switch (spec.covariance) {
     case PriorCovariance::kFull:
       break;

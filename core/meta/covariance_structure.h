@@ -48,7 +48,7 @@ struct StructuredCovariance {
 /// C itself (kFull), its blocks of each tensor (kBlock), V Vᵀ + D (kLowRank and kManifold, FitFactors). All maximise ℓ above.
 ///
 /// @param tensors  what adapts, piece by piece; their sizes add up to p.
-StructuredCovariance FitStructure(const GaussianPriorSpec& spec, const Pieces& tensors, const Eigen::MatrixXd& second_moment);
+StructuredCovariance FitStructure(const GaussianPriorSpec& spec, const nn::Pieces& tensors, const Eigen::MatrixXd& second_moment);
 
 /// Errors: InvalidArgument naming gaussian_prior.rank if it exceeds the number of parameters that adapt.
 absl::Status CheckStructure(const GaussianPriorSpec& spec, Eigen::Index parameters);

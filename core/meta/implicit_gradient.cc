@@ -27,7 +27,7 @@ template <typename T>
 ImplicitGradient<T>::ImplicitGradient(const nn::ParameterLayout& layout, const nn::Mask& adapted, double proximal,
                                       const ImplicitMamlSpec& solver)
     : size_(static_cast<size_t>(layout.size())),
-      frozen_(PiecesOf(layout, adapted, false)),
+      frozen_(nn::PiecesOf(layout, adapted, false)),
       proximal_(proximal),
       solver_(solver) {}
 

@@ -51,7 +51,7 @@ class ImplicitGradient {
   void ClearFrozen(std::vector<T>* vector) const;
 
   size_t size_;
-  Pieces frozen_;
+  nn::Pieces frozen_;
   double proximal_;
   ImplicitMamlSpec solver_;
 };

@@ -8,13 +8,16 @@
 namespace metaekf::meta {
 namespace {
 
+/// m̂ / (√v̂ + ε), the direction of a step of Adam.
+double Direction(double m, double v, const AdamCorrections& corrections) {
+  return m / corrections.first / (std::sqrt(v / corrections.second) + kAdamEpsilon);
+}
+
 /// One element of a step of Adam backwards, with every adjoint negated as PullBack subtracts them.
 /// @param to_direction  −d̄. @param m_adjoint, v_adjoint  −m̄ and −v̄ as the later steps have left them. @return −ḡ.
 template <typename T>
-double PullBackAdam(double to_direction, double g, double m, double v, const AdamCorrections& corrections, T* m_adjoint,
-                    T* v_adjoint, double* direction) {
+double PullBackAdam(double to_direction, double g, double m, double v, const AdamCorrections& corrections, T* m_adjoint, T* v_adjoint) {
   const double m_hat = m / corrections.first, root = std::sqrt(v / corrections.second), scale = root + kAdamEpsilon;
-  *direction = m_hat / scale;
   const double to_m = *m_adjoint + to_direction / (corrections.first * scale);
   double to_v = *v_adjoint;
   if (root > 0) to_v -= to_direction * m_hat / (2 * corrections.second * root * scale * scale);
@@ -24,15 +27,6 @@ double PullBackAdam(double to_direction, double g, double m, double v, const Ada
 }
 
 }  // namespace
-
-Pieces PiecesOf(const nn::ParameterLayout& layout, const nn::Mask& mask, bool flag) {
-  Pieces pieces;
-  for (size_t i = 0; i < mask.size(); ++i) {
-    const nn::Tensor& tensor = layout.tensors()[i];
-    if (mask[i] == flag) pieces.push_back({tensor.offset, tensor.size()});
-  }
-  return pieces;
-}
 
 std::vector<double> RatesOfTensors(const InnerLoopSpec& spec, const nn::ParameterLayout& layout) {
   std::vector<double> rates;
@@ -56,15 +50,16 @@ template <typename T>
 InnerLoop<T>::InnerLoop(const nn::ParameterLayout& layout, const nn::Mask& adapted, Optimiser optimiser, int32_t steps,
                         double pull, InnerRecord record)
     : size_(layout.size()),
-      adapted_(PiecesOf(layout, adapted, true)),
-      frozen_(PiecesOf(layout, adapted, false)),
+      adapted_(nn::PiecesOf(layout, adapted, true)),
+      frozen_(nn::PiecesOf(layout, adapted, false)),
       optimiser_(optimiser),
       steps_(steps),
       pull_(pull),
       record_(record) {}
 
 template <typename T>
-InnerLoop<T>::Trace::Trace(const InnerLoop& owner, bool rates_are_learned) : size_(owner.size_) {
+InnerLoop<T>::Trace::Trace(const InnerLoop& owner, bool rates_are_learned, base::Executor* executor)
+    : size_(owner.size_), executor_(executor) {
   const size_t size = static_cast<size_t>(owner.size_), steps = static_cast<size_t>(owner.steps_);
   const bool adam = owner.optimiser_ == Optimiser::kAdam, all = owner.record_ == InnerRecord::kSteps;
   iterates_.resize(all ? (steps + 1) * size : size);
@@ -92,42 +87,48 @@ const T* InnerLoop<T>::Run(const T* start, const std::vector<double>& rates, Gra
   for (int32_t m = 1; m <= steps_; ++m) {
     const T* current = trace->At(trace->iterates_, m - 1);
     gradient(current, trace->At(trace->gradients_, m - 1));
-    T* next = trace->At(trace->iterates_, m);
-    if (next != current) std::copy_n(current, size_, next);
-    Step(m, start, rates, next, trace);
+    Step(m, start, rates, current, trace->At(trace->iterates_, m), trace);
   }
   return trace->At(trace->iterates_, steps_);
 }
 
 template <typename T>
-void InnerLoop<T>::Step(int32_t m, const T* start, const std::vector<double>& rates, T* iterate, Trace* trace) const {
-  const bool adam = optimiser_ == Optimiser::kAdam, sums = !trace->total_.empty();
-  const AdamCorrections corrections(m);
+void InnerLoop<T>::Step(int32_t m, const T* start, const std::vector<double>& rates, const T* from, T* to, Trace* trace) const {
   const T* gradient = trace->At(trace->gradients_, m - 1);
+  const auto descend = [&](size_t l, int64_t begin, int64_t end) {
+    const T rate = static_cast<T>(rates[l]), shrink = static_cast<T>(1 / (1 + rates[l] * pull_));
+    for (int64_t i = begin; i < end; ++i) to[i] = from[i] - rate * gradient[i];
+    for (int64_t i = begin; pull_ > 0 && i < end; ++i) to[i] = start[i] + shrink * (to[i] - start[i]);
+  };
   T* first = trace->At(trace->first_, m - 1);
   T* second = trace->At(trace->second_, m - 1);
   const T* last_first = m > 1 ? trace->At(trace->first_, m - 2) : nullptr;
   const T* last_second = m > 1 ? trace->At(trace->second_, m - 2) : nullptr;
-  for (size_t l = 0; l < adapted_.size(); ++l) {
-    const T rate = static_cast<T>(rates[l]), shrink = static_cast<T>(1 / (1 + rates[l] * pull_));
-    for (int64_t i = adapted_[l].first; i < adapted_[l].first + adapted_[l].second; ++i) {
-      T direction = gradient[i];
-      if (adam) {
-        double m1 = last_first ? last_first[i] : T(0), m2 = last_second ? last_second[i] : T(0);
-        const double pulled = gradient[i] + pull_ * (iterate[i] - start[i]);
-        direction = static_cast<T>(AdamDirection(pulled, corrections, &m1, &m2));
-        first[i] = static_cast<T>(m1);
-        second[i] = static_cast<T>(m2);
-      }
-      if (sums) trace->total_[static_cast<size_t>(i)] += direction;
-      iterate[i] -= rate * direction;
-      if (!adam && pull_ > 0) iterate[i] = start[i] + shrink * (iterate[i] - start[i]);
+  const AdamCorrections corrections(m);
+  T* total = trace->total_.empty() ? nullptr : trace->total_.data();
+  const auto adam = [&](size_t l, int64_t begin, int64_t end) {
+    const T rate = static_cast<T>(rates[l]);
+    for (int64_t i = begin; i < end; ++i) {
+      double m1 = last_first ? last_first[i] : T(0), m2 = last_second ? last_second[i] : T(0);
+      const double pulled = gradient[i] + pull_ * (from[i] - start[i]);
+      const T direction = static_cast<T>(AdamDirection(pulled, corrections, &m1, &m2));
+      first[i] = static_cast<T>(m1);
+      second[i] = static_cast<T>(m2);
+      if (total) total[i] += direction;
+      to[i] = from[i] - rate * direction;
     }
+  };
+  const auto add_gradient = [&](size_t, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) total[i] += gradient[i];
+  };
+  if (optimiser_ == Optimiser::kAdam) {
+    nn::ForParts(adapted_, trace->executor_, adam);
+  } else {
+    nn::ForParts(adapted_, trace->executor_, descend);
+    if (total) nn::ForParts(adapted_, trace->executor_, add_gradient);
   }
-  if (!sums) return;
-  for (const auto& [offset, size] : frozen_) {
-    for (int64_t i = offset; i < offset + size; ++i) trace->total_[static_cast<size_t>(i)] += gradient[i];
-  }
+  if (total) nn::ForParts(frozen_, trace->executor_, add_gradient);
+  if (from != to) nn::ForParts(frozen_, trace->executor_, [&](size_t, int64_t begin, int64_t end) { std::copy(from + begin, from + end, to + begin); });
 }
 
 template <typename T>
@@ -137,21 +138,22 @@ void InnerLoop<T>::StepAdjoint(int32_t m, const std::vector<double>& rates, cons
   const T* gradient = trace->At(trace->gradients_, m - 1);
   const T* first = trace->At(trace->first_, m - 1);
   const T* second = trace->At(trace->second_, m - 1);
-  for (size_t l = 0; l < adapted_.size(); ++l) {
+  const bool is_adam = optimiser_ == Optimiser::kAdam;
+  for (size_t l = 0; rate_adjoint && l < adapted_.size(); ++l) {
     double by_rate = 0;
     for (int64_t i = adapted_[l].first; i < adapted_[l].first + adapted_[l].second; ++i) {
-      const size_t k = static_cast<size_t>(i);
-      double to_gradient = rates[l] * static_cast<double>(adjoint[i]);
-      double direction = gradient[i];
-      if (optimiser_ == Optimiser::kAdam) {
-        to_gradient = PullBackAdam(to_gradient, gradient[i], first[i], second[i], corrections, &trace->first_adjoint_[k],
-                                   &trace->second_adjoint_[k], &direction);
-      }
-      trace->direction_[k] = static_cast<T>(to_gradient);
-      by_rate += static_cast<double>(adjoint[i]) * direction;
+      by_rate += static_cast<double>(adjoint[i]) * (is_adam ? Direction(first[i], second[i], corrections) : static_cast<double>(gradient[i]));
     }
-    if (rate_adjoint) rate_adjoint[l] -= by_rate;
+    rate_adjoint[l] -= by_rate;
   }
+  nn::ForParts(adapted_, trace->executor_, [&](size_t l, int64_t begin, int64_t end) {
+    T* direction = trace->direction_.data();
+    for (int64_t i = begin; !is_adam && i < end; ++i) direction[i] = static_cast<T>(rates[l] * static_cast<double>(adjoint[i]));
+    for (int64_t i = begin; is_adam && i < end; ++i) {
+      direction[i] = static_cast<T>(PullBackAdam(rates[l] * static_cast<double>(adjoint[i]), gradient[i], first[i], second[i], corrections,
+                                                 trace->first_adjoint_.data() + i, trace->second_adjoint_.data() + i));
+    }
+  });
 }
 
 template <typename T>
@@ -163,7 +165,10 @@ void InnerLoop<T>::PullBack(const std::vector<double>& rates, HessianVector hess
   for (int32_t m = steps_; m >= 1; --m) {
     StepAdjoint(m, rates, adjoint, trace, rate_adjoint);
     hessian_vector(trace->At(trace->iterates_, m - 1), trace->direction_.data(), trace->product_.data());
-    for (int64_t i = 0; i < size_; ++i) adjoint[i] -= trace->product_[static_cast<size_t>(i)];
+    const T* product = trace->product_.data();
+    nn::ForParts({{0, size_}}, trace->executor_, [&](size_t, int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) adjoint[i] -= product[i];
+    });
   }
 }
 

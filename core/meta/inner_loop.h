@@ -15,10 +15,6 @@ std::vector<double> RatesOfTensors(const InnerLoopSpec& spec, const nn::Paramete
 /// Errors: InvalidArgument naming the entry of `tensor_rates` that is no tensor of the layout.
 absl::Status CheckTensorRates(const InnerLoopSpec& spec, const nn::ParameterLayout& layout);
 
-/// Offset and size in ω of each tensor whose flag in the mask is `flag`, in the layout's order.
-using Pieces = std::vector<std::pair<int64_t, int64_t>>;
-Pieces PiecesOf(const nn::ParameterLayout& layout, const nn::Mask& mask, bool flag);
-
 /// What a run of the inner loop leaves behind for the meta-gradient.
 enum class InnerRecord {
   kResult,  ///< ω_M only
@@ -45,11 +41,12 @@ class InnerLoop {
   InnerLoop(const nn::ParameterLayout& layout, const nn::Mask& adapted, Optimiser optimiser, int32_t steps, double pull,
             InnerRecord record);
 
-  /// One run: memory of one thread. In elements of ω: kResult holds two vectors, kSteps of gradient descent M + 1 iterates
+  /// One run: memory of one caller. In elements of ω: kResult holds two vectors, kSteps of gradient descent M + 1 iterates
   /// (and M gradients if rates are learned), of Adam M gradients and 2 M moments more.
   class Trace {
    public:
-    explicit Trace(const InnerLoop& owner, bool rates_are_learned = false);
+    /// @param executor  that steps of large models run on; it must outlive the trace.
+    explicit Trace(const InnerLoop& owner, bool rates_are_learned = false, base::Executor* executor = base::CallingThread());
     /// d_1 + … + d_M, and of parameters that do not adapt the sum of their gradients. With kTotal.
     const T* total() const { return total_.data(); }
 
@@ -58,6 +55,7 @@ class InnerLoop {
     T* At(std::vector<T>& vectors, int32_t index) const;
 
     int64_t size_;
+    base::Executor* executor_;
     std::vector<T> iterates_, gradients_, first_, second_, total_;      // one vector, or one per step
     std::vector<T> direction_, product_, first_adjoint_, second_adjoint_;  // of PullBack
   };
@@ -88,15 +86,16 @@ class InnerLoop {
   /// Tensors that adapt.
   size_t tensors() const { return adapted_.size(); }
   /// Where each is.
-  const Pieces& adapted() const { return adapted_; }
+  const nn::Pieces& adapted() const { return adapted_; }
 
  private:
-  void Step(int32_t m, const T* start, const std::vector<double>& rates, T* iterate, Trace* trace) const;
+  /// From ω_{m−1} to ω_m, which may be one place.
+  void Step(int32_t m, const T* start, const std::vector<double>& rates, const T* from, T* to, Trace* trace) const;
   /// Writes what H is multiplied by in step m.
   void StepAdjoint(int32_t m, const std::vector<double>& rates, const T* adjoint, Trace* trace, double* rate_adjoint) const;
 
   int64_t size_;
-  Pieces adapted_, frozen_;
+  nn::Pieces adapted_, frozen_;
   Optimiser optimiser_;
   int32_t steps_;
   double pull_;

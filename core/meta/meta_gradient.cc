@@ -83,15 +83,13 @@ MetaGradient<T>::MetaGradient(const nssm::Model& model, const TrainingSpec& spec
 }
 
 template <typename T>
-MetaGradient<T>::Scratch::Scratch(const MetaGradient& owner)
-    : trace_(owner.loop_, owner.learned_rates_),
+MetaGradient<T>::Scratch::Scratch(const MetaGradient& owner, base::Executor* executor)
+    : trace_(owner.loop_, owner.learned_rates_, executor),
       implicit_(owner.implicit_, owner.algorithm_ == Algorithm::kImplicitMaml),
       target_gradient_(owner.algorithm_ == Algorithm::kReptile ? static_cast<size_t>(owner.size_) : 0),
       rates_(owner.rates_),
       rate_adjoints_(owner.rates_.size()),
-      inner_(owner.inner_.MakeScratch()),
-      outer_(owner.outer_.MakeScratch()),
-      target_(owner.target_.MakeScratch()) {
+      loss_({&owner.inner_, &owner.outer_, &owner.target_}, executor) {
   if (!owner.least_squares_) return;
   least_squares_ = std::make_unique<nssm::RolloutLeastSquares::Workspace>(*owner.least_squares_, owner.inner_.shape());
   for (auto* vector : {&minimum_, &last_, &step_}) vector->resize(static_cast<size_t>(owner.size_));
@@ -113,7 +111,7 @@ template <typename T>
 const T* MetaGradient<T>::Adapt(const T* variables, const LossData<T>& context, Scratch* scratch) const {
   if (least_squares_) return Minimum(variables, context, scratch);
   ReadRates(variables, scratch);
-  const auto gradient = [&](const T* at, T* result) { inner_.Gradient(at, context, result, scratch->inner_); };
+  const auto gradient = [&](const T* at, T* result) { inner_.Gradient(at, context, result, &scratch->loss_); };
   return loop_.Run(variables, scratch->rates_, gradient, &scratch->trace_);
 }
 
@@ -132,11 +130,11 @@ template <typename T>
 void MetaGradient<T>::Settle(const T* start, const LossData<T>& context, Scratch* scratch) const {
   std::vector<T>&at = scratch->minimum_, &step = scratch->step_, &last = scratch->last_;
   const auto hessian_vector = [&](const T* v, T* product) {
-    inner_.HessianVector(at.data(), context, v, product, scratch->inner_);
+    inner_.HessianVector(at.data(), context, v, product, &scratch->loss_);
   };
   double last_slope = std::numeric_limits<double>::infinity();
   for (int i = 0; i <= kSettlingSteps; ++i) {
-    inner_.Gradient(at.data(), context, step.data(), scratch->inner_);
+    inner_.Gradient(at.data(), context, step.data(), &scratch->loss_);
     double slope = 0, pull = 0;
     for (size_t k = 0; k < at.size(); ++k) {
       const double pulled = proximal_ * (static_cast<double>(at[k]) - static_cast<double>(start[k]));
@@ -156,7 +154,7 @@ void MetaGradient<T>::Settle(const T* start, const LossData<T>& context, Scratch
 template <typename T>
 double MetaGradient<T>::TargetLoss(const T* variables, const LossData<T>& context, const LossData<T>& target,
                                    Scratch* scratch) const {
-  return target_.Value(Adapt(variables, context, scratch), target, scratch->target_);
+  return target_.Value(Adapt(variables, context, scratch), target, &scratch->loss_);
 }
 
 template <typename T>
@@ -173,7 +171,7 @@ std::vector<double> MetaGradient<T>::Curvatures(const T* variables, const LossDa
       const T length = v.norm();
       if (!(length > 0)) break;  // no curvature, or none that is a number
       v /= length;
-      inner_.HessianVector(variables, context, v.data(), product.data(), scratch->inner_);
+      inner_.HessianVector(variables, context, v.data(), product.data(), &scratch->loss_);
       v.segment(offset, size) = product.segment(offset, size);
       const double last = curvature;
       curvature = static_cast<double>(v.norm());
@@ -189,12 +187,12 @@ double MetaGradient<T>::Compute(const T* variables, const LossData<T>& context, 
                                 Scratch* scratch) const {
   if (algorithm_ == Algorithm::kReptile) return Reptile(variables, context, target, gradient, scratch);
   const T* adapted = Adapt(variables, context, scratch);
-  const double loss = target_.Gradient(adapted, target, gradient, scratch->target_);
+  const double loss = target_.Gradient(adapted, target, gradient, &scratch->loss_);
   std::fill(scratch->rate_adjoints_.begin(), scratch->rate_adjoints_.end(), 0.0);
   if (algorithm_ == Algorithm::kMaml) PullBack(context, gradient, scratch);
   if (algorithm_ == Algorithm::kImplicitMaml) {
     const auto hessian_vector = [&](const T* v, T* product) {
-      outer_.HessianVector(adapted, context, v, product, scratch->outer_);
+      outer_.HessianVector(adapted, context, v, product, &scratch->loss_);
     };
     implicit_.Apply(hessian_vector, gradient, &scratch->implicit_);
   }
@@ -205,7 +203,7 @@ double MetaGradient<T>::Compute(const T* variables, const LossData<T>& context, 
 template <typename T>
 void MetaGradient<T>::PullBack(const LossData<T>& context, T* gradient, Scratch* scratch) const {
   const auto hessian_vector = [&](const T* at, const T* v, T* product) {
-    outer_.HessianVector(at, context, v, product, scratch->outer_);
+    outer_.HessianVector(at, context, v, product, &scratch->loss_);
   };
   loop_.PullBack(scratch->rates_, hessian_vector, &scratch->trace_, gradient,
                  learned_rates_ ? scratch->rate_adjoints_.data() : nullptr);
@@ -232,14 +230,14 @@ double MetaGradient<T>::Reptile(const T* variables, const LossData<T>& context, 
   const double share = samples(context.shape) / (samples(context.shape) + samples(target.shape));
   T* of_target = scratch->target_gradient_.data();
   const auto union_gradient = [&](const T* at, T* result) {
-    outer_.Gradient(at, context, result, scratch->outer_);
-    target_.Gradient(at, target, of_target, scratch->target_);
+    outer_.Gradient(at, context, result, &scratch->loss_);
+    target_.Gradient(at, target, of_target, &scratch->loss_);
     for (int64_t i = 0; i < size_; ++i) result[i] = static_cast<T>(share * result[i] + (1 - share) * of_target[i]);
   };
   const T* adapted = loop_.Run(variables, scratch->rates_, union_gradient, &scratch->trace_);
   std::copy_n(scratch->trace_.total(), size_, gradient);
-  return share * outer_.Value(adapted, context, scratch->outer_) +
-         (1 - share) * target_.Value(adapted, target, scratch->target_);
+  return share * outer_.Value(adapted, context, &scratch->loss_) +
+         (1 - share) * target_.Value(adapted, target, &scratch->loss_);
 }
 
 template class MetaGradient<float>;

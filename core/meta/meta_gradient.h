@@ -41,10 +41,11 @@ class MetaGradient {
   MetaGradient(const nssm::Model& model, const TrainingSpec& spec, const nssm::LossShape& context,
                const nssm::LossShape& target, const nn::Mask& adapted);
 
-  /// Memory of one thread: what InnerLoop::Trace holds, and one step's activations.
+  /// Memory of one caller: what InnerLoop::Trace holds, and one step's activations.
   class Scratch {
    public:
-    explicit Scratch(const MetaGradient& owner);
+    /// @param executor  that the gradients of large models run on (nssm::LossFunction); it must outlive the scratch.
+    explicit Scratch(const MetaGradient& owner, base::Executor* executor = base::CallingThread());
 
    private:
     friend class MetaGradient;
@@ -54,7 +55,7 @@ class MetaGradient {
     std::unique_ptr<nssm::RolloutLeastSquares::Workspace> least_squares_;
     std::vector<T> minimum_, last_, step_;  // of Minimum and Settle
     std::vector<double> rates_, rate_adjoints_;
-    typename nssm::LossFunction<T>::Scratch inner_, outer_, target_;
+    typename nssm::LossFunction<T>::Scratch loss_;
   };
 
   /// n_ω, and the number of adapted tensors if rates are learned.

@@ -83,6 +83,30 @@ absl::StatusOr<Mask> ParseMask(const std::string& text, const ParameterLayout& l
   return mask;
 }
 
+Pieces PiecesOf(const ParameterLayout& layout, const Mask& mask, bool flag) {
+  Pieces pieces;
+  for (size_t i = 0; i < mask.size(); ++i) {
+    const Tensor& tensor = layout.tensors()[i];
+    if (mask[i] == flag) pieces.push_back({tensor.offset, tensor.size()});
+  }
+  return pieces;
+}
+
+void ForParts(const Pieces& pieces, base::Executor* executor, absl::FunctionRef<void(size_t, int64_t, int64_t)> work) {
+  constexpr int64_t kWorthAThread = 1 << 16;  // elements
+  int64_t size = 0;
+  for (const auto& piece : pieces) size += piece.second;
+  const int64_t parts = size < kWorthAThread ? 1 : static_cast<int64_t>(executor->concurrency());
+  const auto run = [&](int64_t part) {
+    for (size_t i = 0; i < pieces.size(); ++i) {
+      const auto [offset, count] = pieces[i];
+      work(i, offset + count * part / parts, offset + count * (part + 1) / parts);
+    }
+  };
+  if (parts == 1) return run(0);
+  executor->ParallelFor(static_cast<size_t>(parts), [&](size_t part, size_t) { run(static_cast<int64_t>(part)); });
+}
+
 ParameterValues BindParameters(const ParameterLayout& layout, int32_t slot, autodiff::Graph* graph) {
   ParameterValues values;
   for (const Tensor& tensor : layout.tensors()) {

@@ -4,10 +4,13 @@
 #include <cstdint>
 #include <span>
 #include <string>
+#include <utility>
 #include <vector>
 
+#include "absl/functional/function_ref.h"
 #include "absl/status/statusor.h"
 #include "core/autodiff/graph.h"
+#include "core/base/executor.h"
 
 namespace metaekf::nn {
 
@@ -50,6 +53,14 @@ using Mask = std::vector<bool>;
 /// characters and a component `4-5` the layers 4 and 5. "" and "*" mean all.
 /// Errors: InvalidArgument naming the item that matches nothing, with the names there are.
 absl::StatusOr<Mask> ParseMask(const std::string& text, const ParameterLayout& layout);
+
+/// Offset and size in ω of each tensor whose flag in the mask is `flag`, in the layout's order.
+using Pieces = std::vector<std::pair<int64_t, int64_t>>;
+Pieces PiecesOf(const ParameterLayout& layout, const Mask& mask, bool flag);
+
+/// Calls work(piece, begin, end) for elements begin … end − 1 of ω, until all of the pieces are done: those of large models side by side.
+/// For work on one element after the other: what it does to one must not depend on where parts begin.
+void ForParts(const Pieces& pieces, base::Executor* executor, absl::FunctionRef<void(size_t piece, int64_t begin, int64_t end)> work);
 
 /// Parameters as values of a graph, one per tensor, each stored in × out (the transpose of the tensor).
 using ParameterValues = std::vector<autodiff::Value>;

@@ -26,6 +26,44 @@ enum Slot : int32_t {
   kVectorOut,
 };
 
+/// Multiplications of a rollout's parameters from which on threads are worth being woken, and rollout steps in a block that keep products
+/// of matrices near their speed.
+constexpr int64_t kLargeLoss = 1 << 22;
+constexpr int64_t kBlockColumns = 32, kMostBlocks = 16;
+
+/// How many rollouts each block has.
+std::vector<int32_t> BlockSizes(const LossShape& shape, int64_t parameters) {
+  const int64_t columns = int64_t{shape.rollouts} * shape.horizon;
+  const int64_t most = columns * parameters < kLargeLoss ? 1 : std::min({columns / kBlockColumns, kMostBlocks, int64_t{shape.rollouts}});
+  const int32_t blocks = static_cast<int32_t>(std::max<int64_t>(most, 1));
+  std::vector<int32_t> sizes;
+  for (int32_t b = 0; b < blocks; ++b) sizes.push_back(shape.rollouts / blocks + (b < shape.rollouts % blocks ? 1 : 0));
+  return sizes;
+}
+
+/// Columns first … first + count − 1 of every step.
+template <typename T>
+void CopyColumns(const std::vector<T>& from, const LossShape& shape, int32_t steps, int32_t first, int32_t count, std::vector<T>* to) {
+  const size_t width = static_cast<size_t>(shape.rollouts), rows = from.size() / (width * static_cast<size_t>(steps));
+  to->clear();
+  for (int32_t step = 0; step < steps; ++step) {
+    const T* begin = from.data() + (static_cast<size_t>(step) * width + static_cast<size_t>(first)) * rows;
+    to->insert(to->end(), begin, begin + static_cast<size_t>(count) * rows);
+  }
+}
+
+/// Rollouts first … first + count − 1 of a set.
+template <typename T>
+void CopyRollouts(const LossData<T>& from, int32_t first, int32_t count, LossData<T>* to) {
+  to->shape = {count, from.shape.horizon};
+  for (const auto matrix : {&LossData<T>::start, &LossData<T>::first_input, &LossData<T>::first_output}) {
+    CopyColumns(from.*matrix, from.shape, 1, first, count, &(to->*matrix));
+  }
+  for (const auto matrix : {&LossData<T>::inputs, &LossData<T>::states, &LossData<T>::outputs}) {
+    CopyColumns(from.*matrix, from.shape, from.shape.horizon, first, count, &(to->*matrix));
+  }
+}
+
 /// weight · mean((a − b)²)
 autodiff::Value MeanSquaredError(Graph* graph, double weight, autodiff::Value a, autodiff::Value b) {
   const autodiff::Value difference = graph->Sub(a, b);
@@ -126,26 +164,38 @@ LossData<T> CutLossData(const ModelSpec& model, const LossSpec& loss, const data
 template <typename T>
 LossFunction<T>::LossFunction(const Model& model, const LossSpec& loss, const LossShape& shape,
                               const nn::Mask& differentiated, const nn::Mask& along)
-    : shape_(shape) {
+    : shape_(shape),
+      size_(model.layout().size()),
+      differentiated_(nn::PiecesOf(model.layout(), differentiated, true)),
+      undifferentiated_(nn::PiecesOf(model.layout(), differentiated, false)) {
+  int32_t first = 0, last_count = 0;
+  for (const int32_t count : BlockSizes(shape, size_)) {
+    if (count != last_count) programs_.push_back(Compile(model, loss, count, differentiated, along));
+    blocks_.push_back({first, count, programs_.size() - 1});
+    first += count;
+    last_count = count;
+  }
+}
+
+template <typename T>
+typename LossFunction<T>::Programs LossFunction<T>::Compile(const Model& model, const LossSpec& loss, int32_t rollouts,
+                                                            const nn::Mask& differentiated, const nn::Mask& along) const {
   Graph graph;
   const nn::ParameterLayout& layout = model.layout();
   const nn::ParameterValues parameters = nn::BindParameters(layout, kParameters, &graph);
   const nn::ParameterValues directions = nn::BindParameters(layout, kDirection, &graph);
-  const autodiff::Value total = BuildLoss(model, loss, shape, parameters, &graph);
+  const double share = static_cast<double>(rollouts) / shape_.rollouts;
+  const autodiff::Value total = graph.Scale(BuildLoss(model, loss, {rollouts, shape_.horizon}, parameters, &graph), share);
   std::vector<autodiff::Value> wrt;
   std::vector<int64_t> offsets;
   std::vector<autodiff::Seed> seeds;
   for (size_t i = 0; i < parameters.size(); ++i) {
-    const nn::Tensor& tensor = layout.tensors()[i];
     if (along[i]) seeds.push_back({parameters[i], directions[i]});
-    if (differentiated[i]) {
-      wrt.push_back(parameters[i]);
-      offsets.push_back(tensor.offset);
-    } else {
-      undifferentiated_.push_back({tensor.offset, tensor.size()});
-    }
+    if (!differentiated[i]) continue;
+    wrt.push_back(parameters[i]);
+    offsets.push_back(layout.tensors()[i].offset);
   }
-  value_.emplace(autodiff::Compile(graph, {{total, kLossOut}}));
+  autodiff::Executable<T> value(autodiff::Compile(graph, {{total, kLossOut}}));
   const std::vector<autodiff::Value> gradient = autodiff::Gradient(&graph, total, wrt);
   std::vector<autodiff::Value> product = autodiff::Jvp(&graph, seeds, gradient);
   std::vector<Output> gradient_outputs{{total, kLossOut}}, product_outputs;
@@ -155,53 +205,81 @@ LossFunction<T>::LossFunction(const Model& model, const LossSpec& loss, const Lo
     gradient_outputs.push_back({gradient[i], kVectorOut, offsets[i]});
     product_outputs.push_back({product[i], kVectorOut, offsets[i]});
   }
-  gradient_.emplace(autodiff::Compile(graph, gradient_outputs));
-  hessian_.emplace(autodiff::Compile(graph, product_outputs));
+  return {std::move(value), autodiff::Executable<T>(autodiff::Compile(graph, gradient_outputs)),
+          autodiff::Executable<T>(autodiff::Compile(graph, product_outputs))};
 }
 
 template <typename T>
-Slots<T> LossFunction<T>::Bind(const T* parameters, const LossData<T>& data) {
-  Slots<T> slots;
-  slots.Input(kParameters, parameters)
-      .Input(kStart, data.start.data())
-      .Input(kFirstInput, data.first_input.data())
-      .Input(kInputs, data.inputs.data())
-      .Input(kStates, data.states.data())
-      .Input(kOutputs, data.outputs.data())
-      .Input(kFirstOutput, data.first_output.data());
-  return slots;
+LossFunction<T>::Scratch::Scratch(std::initializer_list<const LossFunction*> users, base::Executor* executor) : executor_(executor) {
+  size_t blocks = 0;
+  std::vector<const autodiff::Executable<T>*> programs;
+  for (const LossFunction* user : users) {
+    blocks = std::max(blocks, user->blocks_.size());
+    for (const Programs& own : user->programs_) programs.insert(programs.end(), {&own.value, &own.gradient, &own.hessian});
+  }
+  for (size_t i = 0; i < std::min(executor->concurrency(), blocks); ++i) arenas_.emplace_back(programs);
+  losses_.resize(blocks);
+  if (blocks == 1) return;
+  data_.resize(blocks);
+  vectors_.resize(blocks);
+  for (size_t block = 1; block < blocks; ++block) vectors_[block].resize(static_cast<size_t>((*users.begin())->size_));
 }
 
 template <typename T>
-void LossFunction<T>::ClearUndifferentiated(T* vector) const {
-  for (const auto& [offset, size] : undifferentiated_) std::fill_n(vector + offset, size, T(0));
+double LossFunction<T>::RunBlocks(autodiff::Executable<T> Programs::*program, const T* parameters, const LossData<T>& data, const T* v,
+                                  T* vector, Scratch* scratch) const {
+  const auto run = [&](size_t block, const LossData<T>& of_block, T* to, size_t arena) {
+    Slots<T> slots;
+    slots.Input(kParameters, parameters)
+        .Input(kStart, of_block.start.data())
+        .Input(kFirstInput, of_block.first_input.data())
+        .Input(kInputs, of_block.inputs.data())
+        .Input(kStates, of_block.states.data())
+        .Input(kOutputs, of_block.outputs.data())
+        .Input(kFirstOutput, of_block.first_output.data())
+        .Input(kDirection, v)
+        .Output(kLossOut, &scratch->losses_[block])
+        .Output(kVectorOut, to);
+    autodiff::Evaluate(programs_[blocks_[block].programs].*program, slots, scratch->arenas_[arena]);
+  };
+  const size_t blocks = blocks_.size();
+  if (blocks == 1) {
+    run(0, data, vector, 0);
+  } else {
+    scratch->executor_->ParallelFor(blocks, [&](size_t block, size_t slot) {
+      CopyRollouts(data, blocks_[block].first, blocks_[block].count, &scratch->data_[block]);
+      run(block, scratch->data_[block], block == 0 ? vector : scratch->vectors_[block].data(), scratch->arenas_.size() >= blocks ? block : slot);
+    });
+  }
+  if (vector != nullptr) {
+    for (const auto& [offset, size] : undifferentiated_) std::fill_n(vector + offset, size, T(0));
+  }
+  if (vector != nullptr && blocks > 1) {
+    nn::ForParts(differentiated_, scratch->executor_, [&](size_t, int64_t begin, int64_t end) {
+      for (size_t block = 1; block < blocks; ++block) {
+        const T* const other = scratch->vectors_[block].data();
+        for (int64_t i = begin; i < end; ++i) vector[i] += other[i];
+      }
+    });
+  }
+  double sum = 0;
+  for (size_t block = 0; block < blocks; ++block) sum += static_cast<double>(scratch->losses_[block]);
+  return sum;
 }
 
 template <typename T>
-double LossFunction<T>::Value(const T* parameters, const LossData<T>& data, const Scratch& scratch) const {
-  T loss = 0;
-  Slots<T> slots = Bind(parameters, data);
-  autodiff::Evaluate(*value_, slots.Output(kLossOut, &loss), scratch);
-  return static_cast<double>(loss);
+double LossFunction<T>::Value(const T* parameters, const LossData<T>& data, Scratch* scratch) const {
+  return RunBlocks(&Programs::value, parameters, data, nullptr, nullptr, scratch);
 }
 
 template <typename T>
-double LossFunction<T>::Gradient(const T* parameters, const LossData<T>& data, T* gradient, const Scratch& scratch) const {
-  T loss = 0;
-  Slots<T> slots = Bind(parameters, data);
-  slots.Output(kLossOut, &loss).Output(kVectorOut, gradient);
-  ClearUndifferentiated(gradient);
-  autodiff::Evaluate(*gradient_, slots, scratch);
-  return static_cast<double>(loss);
+double LossFunction<T>::Gradient(const T* parameters, const LossData<T>& data, T* gradient, Scratch* scratch) const {
+  return RunBlocks(&Programs::gradient, parameters, data, nullptr, gradient, scratch);
 }
 
 template <typename T>
-void LossFunction<T>::HessianVector(const T* parameters, const LossData<T>& data, const T* v, T* product,
-                                    const Scratch& scratch) const {
-  Slots<T> slots = Bind(parameters, data);
-  slots.Input(kDirection, v).Output(kVectorOut, product);
-  ClearUndifferentiated(product);
-  autodiff::Evaluate(*hessian_, slots, scratch);
+void LossFunction<T>::HessianVector(const T* parameters, const LossData<T>& data, const T* v, T* product, Scratch* scratch) const {
+  RunBlocks(&Programs::hessian, parameters, data, v, product, scratch);
 }
 
 template LossData<float> CutLossData(const ModelSpec&, const LossSpec&, const data::Trajectory&, int64_t, const LossShape&);

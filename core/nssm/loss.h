@@ -1,10 +1,11 @@
 #pragma once
 
-#include <optional>
+#include <initializer_list>
 #include <vector>
 
 #include "absl/status/statusor.h"
 #include "core/autodiff/evaluate.h"
+#include "core/base/executor.h"
 #include "core/data/trajectory.h"
 #include "core/nssm/model.h"
 
@@ -51,7 +52,9 @@ LossData<T> CutLossData(const ModelSpec& model, const LossSpec& loss, const data
 ///
 /// each mean over rollouts, steps and components, in normalised units.
 /// Only the parameters of the mask are differentiated; elements of the others are zero in a gradient.
-/// Compiled once, then safe to call concurrently with a workspace each. No call allocates.
+/// Where a large model meets many samples, rollouts are cut into blocks that run side by side on the scratch's executor and are summed
+/// in order. Blocks depend on sizes alone, so results do not depend on the number of threads.
+/// Compiled once, then safe to call concurrently with a scratch each. No call allocates.
 /// Source: paper.tex eqs. nssm-loss-fn-1, nssm-loss-fn-2; the output path of Case II is the filter's h (eq. h_bar).
 template <typename T>
 class LossFunction {
@@ -60,25 +63,51 @@ class LossFunction {
   LossFunction(const Model& model, const LossSpec& loss, const LossShape& shape, const nn::Mask& differentiated,
                const nn::Mask& along);
 
-  /// Scratch for one thread.
-  using Scratch = autodiff::Arena<T>;
-  Scratch MakeScratch() const { return Scratch({&*value_, &*gradient_, &*hessian_}); }
+  /// Memory of one caller, for any of a few functions, one at a time.
+  class Scratch {
+   public:
+    /// @param executor  that blocks run on; it must outlive the scratch.
+    explicit Scratch(std::initializer_list<const LossFunction*> users, base::Executor* executor = base::CallingThread());
 
-  double Value(const T* parameters, const LossData<T>& data, const Scratch& scratch) const;
+   private:
+    friend class LossFunction;
+    base::Executor* executor_;
+    std::vector<autodiff::Arena<T>> arenas_;  // of each thread, or of each block where these are fewer
+    std::vector<T> losses_;                   // of each block
+    // Where there are several blocks, what each reads, and what each but the first writes.
+    std::vector<LossData<T>> data_;
+    std::vector<std::vector<T>> vectors_;
+  };
+  Scratch MakeScratch(base::Executor* executor = base::CallingThread()) const { return Scratch({this}, executor); }
+
+  double Value(const T* parameters, const LossData<T>& data, Scratch* scratch) const;
   /// @param gradient  n_ω elements, all written. @return L.
-  double Gradient(const T* parameters, const LossData<T>& data, T* gradient, const Scratch& scratch) const;
+  double Gradient(const T* parameters, const LossData<T>& data, T* gradient, Scratch* scratch) const;
   /// @param product  n_ω elements, all written: H v. Elements of v outside `along` are ignored.
-  void HessianVector(const T* parameters, const LossData<T>& data, const T* v, T* product, const Scratch& scratch) const;
+  void HessianVector(const T* parameters, const LossData<T>& data, const T* v, T* product, Scratch* scratch) const;
 
   const LossShape& shape() const { return shape_; }
 
  private:
-  static autodiff::Slots<T> Bind(const T* parameters, const LossData<T>& data);
-  void ClearUndifferentiated(T* vector) const;
+  /// Of a number of rollouts.
+  struct Programs {
+    autodiff::Executable<T> value, gradient, hessian;
+  };
+  /// Rollouts first … first + count − 1.
+  struct Block {
+    int32_t first, count;
+    size_t programs;
+  };
+  Programs Compile(const Model& model, const LossSpec& loss, int32_t rollouts, const nn::Mask& differentiated, const nn::Mask& along) const;
+  /// Runs one program of every block and sums what they write. @param v  or null. @param vector  or null. @return the sum of losses.
+  double RunBlocks(autodiff::Executable<T> Programs::*program, const T* parameters, const LossData<T>& data, const T* v, T* vector,
+                   Scratch* scratch) const;
 
   LossShape shape_;
-  std::vector<std::pair<int64_t, int64_t>> undifferentiated_;  // offset and size of each
-  std::optional<autodiff::Executable<T>> value_, gradient_, hessian_;  // set by the constructor, always
+  int64_t size_;  // of ω
+  nn::Pieces differentiated_, undifferentiated_;
+  std::vector<Block> blocks_;
+  std::vector<Programs> programs_;  // of the numbers of rollouts that blocks have
 };
 
 }  // namespace metaekf::nssm

@@ -7,12 +7,15 @@
 #include <chrono>
 #include <cstdio>
 #include <functional>
+#include <map>
 #include <string>
+#include <thread>
 #include <vector>
 
 #include "core/base/json_fields.h"
 #include "core/filter/ekf.h"
 #include "core/meta/meta_gradient.h"
+#include "tests/benchmark/report.h"
 #include "tests/core/nssm/random_models.h"
 #include "tests/support/bundles.h"
 
@@ -20,6 +23,8 @@ namespace metaekf {
 namespace {
 
 using autodiff::Activation;
+
+constexpr int kRounds = 3;  // beside a peer
 
 double MedianSeconds(int repeats, const std::function<void()>& work) {
   work();
@@ -81,13 +86,14 @@ MetaSeconds LocalisationLearning() {
   MetaSeconds seconds{};
   const nn::Mask adapted = *nn::ParseMask("encoder.5-6,transition,*_decoder", model.layout());
   const nssm::LossFunction<float> context_loss(model, loss, shape, adapted, adapted);
-  const auto scratch = context_loss.MakeScratch();
+  const auto executor = base::MakeThreadExecutor(std::max(1U, std::thread::hardware_concurrency()));
+  auto scratch = context_loss.MakeScratch(executor.get());
   std::vector<float> gradient(static_cast<size_t>(size));
   const meta::InnerLoop<float> loop(model.layout(), adapted, meta::Optimiser::kGradientDescent, kSteps, 0,
                                     meta::InnerRecord::kResult);
-  meta::InnerLoop<float>::Trace trace(loop);
+  meta::InnerLoop<float>::Trace trace(loop, false, executor.get());
   const std::vector<double> rates(loop.tensors(), 1e-6);
-  const auto context_gradient = [&](const float* at, float* result) { context_loss.Gradient(at, context, result, scratch); };
+  const auto context_gradient = [&](const float* at, float* result) { context_loss.Gradient(at, context, result, &scratch); };
   seconds.adapt = MedianSeconds(7, [&] { loop.Run(parameters.data(), rates, context_gradient, &trace); });
   const nn::Mask all(model.layout().tensors().size(), true);
   for (const bool second_order : {true, false}) {
@@ -95,7 +101,7 @@ MetaSeconds LocalisationLearning() {
     training.algorithm = second_order ? meta::Algorithm::kMaml : meta::Algorithm::kFirstOrderMaml;
     training.inner_loop = {.steps = kSteps, .learning_rate = 1e-3};
     const meta::MetaGradient<float> meta(model, training, shape, shape, all);
-    meta::MetaGradient<float>::Scratch meta_scratch(meta);
+    meta::MetaGradient<float>::Scratch meta_scratch(meta, executor.get());
     (second_order ? seconds.maml : seconds.fomaml) = MedianSeconds(
         5, [&] { meta.Compute(parameters.data(), context, target, gradient.data(), &meta_scratch); });
   }
@@ -114,11 +120,11 @@ double SmallRolloutSeconds() {
   const auto data = nssm::CutLossData<float>(spec, loss, nssm::RandomTrajectory(spec, 4097, 1), 0, shape);
   const nn::Mask mask = *nn::ParseMask("transition,output_decoder", model.layout());
   const nssm::LossFunction<float> function(model, loss, shape, mask, mask);
-  const auto scratch = function.MakeScratch();
+  auto scratch = function.MakeScratch();
   const std::vector<double> initial = model.InitialParameters(1);
   const std::vector<float> parameters(initial.begin(), initial.end());
   std::vector<float> gradient(parameters.size());
-  return MedianSeconds(51, [&] { function.Gradient(parameters.data(), data, gradient.data(), scratch); });
+  return MedianSeconds(51, [&] { function.Gradient(parameters.data(), data, gradient.data(), &scratch); });
 }
 
 double PeakRssMib() {
@@ -139,37 +145,52 @@ nlohmann::json RunPeer(const std::string& script) {
   return base::ParseJson(text, &result).ok() ? result["best"] : nlohmann::json();
 }
 
-int Main(const std::string& peer_script) {
-  const double ekf = EkfStepSeconds();
-  const MetaSeconds learning = LocalisationLearning();
-  const double rollout = SmallRolloutSeconds();
-  const double memory = PeakRssMib();
-  const nlohmann::json peer = peer_script.empty() ? nlohmann::json() : RunPeer(peer_script);
-  if (!peer_script.empty() && peer.is_null()) std::fprintf(stderr, "the peer could not be run: its columns are empty\n");
-  std::printf("%-34s %12s %12s %8s\n", "", "metaekf", "peer", "ratio");
-  const auto row = [&peer](const char* name, const char* key, double value) {
-    std::printf("%-34s %12.4g", name, value);
-    if (peer.contains(key)) std::printf(" %12.4g %8.1f", peer[key].get<double>(), peer[key].get<double>() / value);
-    std::printf("\n");
+int Main(const std::string& peer_script, const std::string& json) {
+  std::map<std::string, std::vector<double>> ours, peers;
+  for (int round = 0; round < (peer_script.empty() ? 1 : kRounds); ++round) {
+    const MetaSeconds learning = LocalisationLearning();
+    ours["ekf_step_us"].push_back(1e6 * EkfStepSeconds());
+    ours["adapt_ms"].push_back(1e3 * learning.adapt);
+    ours["maml_ms"].push_back(1e3 * learning.maml);
+    ours["fomaml_ms"].push_back(1e3 * learning.fomaml);
+    ours["rollout_grad_ms"].push_back(1e3 * SmallRolloutSeconds());
+    if (round == 0) ours["peak_rss_mib"].push_back(PeakRssMib());
+    if (peer_script.empty()) break;
+    const nlohmann::json peer = RunPeer(peer_script);
+    if (peer.is_null()) {
+      std::fprintf(stderr, "the peer could not be run (it needs Debian's python3-torch): its column is empty\n");
+      break;
+    }
+    for (const auto& [key, value] : peer.items()) peers[key].push_back(value.get<double>());
+  }
+  std::vector<benchmark::Row> rows;
+  const auto add = [&](const char* what, const char* unit, const std::string& key, const char* ratio_key) {
+    const double own = benchmark::Median(ours[key]), peer = benchmark::Median(peers[key]);
+    rows.push_back({what, unit, own, peer, peer / own, ratio_key});
   };
-  row("EKF step, us", "ekf_step_us", ekf * 1e6);
-  row("adaptation M=10 N=80, ms", "adapt_ms", learning.adapt * 1e3);
-  row("meta-gradient, second order, ms", "maml_ms", learning.maml * 1e3);
-  row("meta-gradient, first order, ms", "fomaml_ms", learning.fomaml * 1e3);
-  row("rollout gradient, 4096 steps, ms", "rollout_grad_ms", rollout * 1e3);
-  row("peak memory, MiB", "peak_rss_mib", memory);
-  std::printf("%-34s %12.4g\n", "EKF steps per second", 1 / ekf);
-  return 0;
+  add("EKF step", "µs", "ekf_step_us", "ekf_step");
+  add("adaptation, M = 10, N = 80", "ms", "adapt_ms", "adapt");
+  add("meta-gradient of one task, second order", "ms", "maml_ms", "maml");
+  add("meta-gradient of one task, first order", "ms", "fomaml_ms", "fomaml");
+  add("gradient of a small rollout, 4,096 steps", "ms", "rollout_grad_ms", "rollout_grad");
+  add("peak memory of all of this", "MiB", "peak_rss_mib", "peak_memory");
+  benchmark::Print("Compute", rows);
+  if (json.empty() || benchmark::AddToJson(json, rows)) return 0;
+  std::fprintf(stderr, "%s cannot be written\n", json.c_str());
+  return 1;
 }
 
 }  // namespace
 }  // namespace metaekf
 
 int main(int argc, char** argv) {
-  const bool with_peer = argc == 3 && std::string(argv[1]) == "--peer";
-  if (argc != 1 && !with_peer) {
-    std::fprintf(stderr, "usage: %s [--peer SCRIPT]\n", argv[0]);
+  std::map<std::string, std::string> options = {{"--peer", ""}, {"--json", ""}};
+  for (int i = 1; i + 1 < argc; i += 2) {
+    if (const auto option = options.find(argv[i]); option != options.end()) option->second = argv[i + 1];
+  }
+  if (argc % 2 == 0 || argc > 5 || (argc > 1 && options["--peer"].empty() && options["--json"].empty())) {
+    std::fprintf(stderr, "usage: %s [--peer SCRIPT] [--json FILE]\n", argv[0]);
     return 2;
   }
-  return metaekf::Main(with_peer ? argv[2] : "");
+  return metaekf::Main(options["--peer"], options["--json"]);
 }

@@ -1,7 +1,9 @@
 #include "core/linalg/products.h"
 
 #include <cmath>
+#include <cstdlib>
 #include <limits>
+#include <memory>
 #include <string>
 #include <utility>
 #include <vector>
@@ -115,6 +117,44 @@ TEST_P(ProductsTest, ASquareIsTheProductWithTheTransposed) {
     }
   }
 }
+
+/// Against sums one by one, with and without an addend, that of the result too.
+template <typename T>
+void CheckPanelProducts() {
+  base::Rng rng(11);
+  for (int trial = 0; trial < 300; ++trial) {
+    const auto [m, n, k] = RandomShape(&rng);
+    const bool transpose = trial % 2 == 1;
+    const std::vector<double> a = Random(static_cast<size_t>(m) * k, &rng), b = Random(static_cast<size_t>(k) * n, &rng),
+                              d = Random(static_cast<size_t>(m) * n, &rng);
+    const std::vector<T> ta(a.begin(), a.end()), tb(b.begin(), b.end()), td(d.begin(), d.end());
+    const size_t size = static_cast<size_t>(PanelSize(m, k));
+    std::unique_ptr<T[], decltype(&std::free)> panel(static_cast<T*>(std::aligned_alloc(128, (size * sizeof(T) + 127) / 128 * 128)), &std::free);
+    MakePanel(transpose, m, k, ta.data(), transpose ? k : m, panel.get());
+    std::vector<T> plain(td.size()), added(td.size()), in_place = td;
+    PanelProduct<T>(m, n, k, panel.get(), tb.data(), k, nullptr, 0, plain.data(), m);
+    PanelProduct<T>(m, n, k, panel.get(), tb.data(), k, td.data(), m, added.data(), m);
+    PanelProduct<T>(m, n, k, panel.get(), tb.data(), k, in_place.data(), m, in_place.data(), m);
+    EXPECT_EQ(added, in_place);
+    for (int32_t j = 0; j < n; ++j) {
+      for (int32_t i = 0; i < m; ++i) {
+        double sum = 0, size_of_terms = 0;
+        for (int32_t l = 0; l < k; ++l) {
+          const double term = static_cast<double>(ta[static_cast<size_t>(transpose ? l + i * k : i + l * m)]) * static_cast<double>(tb[static_cast<size_t>(l + j * k)]);
+          sum += term;
+          size_of_terms += std::fabs(term);
+        }
+        const size_t at = static_cast<size_t>(i + j * m);
+        const double tolerance = 4 * k * std::numeric_limits<T>::epsilon() * (size_of_terms + std::fabs(d[at]));
+        ASSERT_NEAR(plain[at], sum, tolerance);
+        ASSERT_NEAR(added[at], sum + static_cast<double>(td[at]), tolerance);
+      }
+    }
+  }
+}
+
+TEST_P(ProductsTest, PanelProductsInFloat) { CheckPanelProducts<float>(); }
+TEST_P(ProductsTest, PanelProductsInDouble) { CheckPanelProducts<double>(); }
 
 INSTANTIATE_TEST_SUITE_P(Targets, ProductsTest, testing::ValuesIn(hwy::SupportedAndGeneratedTargets()),
                          [](const auto& target) { return std::string(hwy::TargetName(target.param)); });

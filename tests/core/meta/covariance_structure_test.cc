@@ -16,7 +16,7 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-const Pieces kTensors = {{0, 3}, {7, 2}, {20, 4}};  // somewhere in ω: only their sizes matter
+const nn::Pieces kTensors = {{0, 3}, {7, 2}, {20, 4}};  // somewhere in ω: only their sizes matter
 constexpr Index kParameters = 9;
 
 MatrixXd RandomMatrix(Index rows, Index cols, uint64_t seed) {

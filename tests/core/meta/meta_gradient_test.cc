@@ -170,10 +170,10 @@ TEST(MetaGradientTest, FirstOrderRatesTakeTheDirectionsForConstants) {
   meta.Compute(variables.data(), task.context, task.target, gradient.data(), &scratch);
   // By hand: the steps once more, their directions summed.
   const nssm::LossFunction<double> loss(task.model, c.loss, task.shape, all, all);
-  const auto loss_scratch = loss.MakeScratch();
+  auto loss_scratch = loss.MakeScratch();
   std::vector<double> parameters = task.parameters;
   for (int m = 0; m < 3; ++m) {
-    loss.Gradient(parameters.data(), task.context, context_gradient.data(), loss_scratch);
+    loss.Gradient(parameters.data(), task.context, context_gradient.data(), &loss_scratch);
     for (size_t l = 0; l < all.size(); ++l) {
       const nn::Tensor& tensor = task.model.layout().tensors()[l];
       for (int64_t k = tensor.offset; k < tensor.offset + tensor.size(); ++k) {
@@ -216,13 +216,13 @@ TEST(MetaGradientTest, TheTargetLossIsThatOfTheAdaptedModel) {
   EXPECT_GT(difference, 0.01 * norm);
   // By hand: five gradient steps on the context loss, then the target loss.
   const nssm::LossFunction<double> loss(task.model, c.loss, task.shape, all, all);
-  const auto scratch = loss.MakeScratch();
+  auto scratch = loss.MakeScratch();
   std::vector<double> parameters = task.parameters, gradient(parameters.size());
   for (int m = 0; m < 5; ++m) {
-    loss.Gradient(parameters.data(), task.context, gradient.data(), scratch);
+    loss.Gradient(parameters.data(), task.context, gradient.data(), &scratch);
     for (size_t i = 0; i < parameters.size(); ++i) parameters[i] -= 0.1 * gradient[i];
   }
-  EXPECT_DOUBLE_EQ(adapted, loss.Value(parameters.data(), task.target, scratch));
+  EXPECT_DOUBLE_EQ(adapted, loss.Value(parameters.data(), task.target, &scratch));
 }
 
 TEST(MetaGradientTest, FirstOrderIsTheTargetGradientAtTheAdaptedModel) {
@@ -234,12 +234,12 @@ TEST(MetaGradientTest, FirstOrderIsTheTargetGradientAtTheAdaptedModel) {
   std::vector<double> result(task.parameters.size()), gradient(result.size()), parameters = task.parameters;
   meta.Compute(task.parameters.data(), task.context, task.target, result.data(), &scratch);
   const nssm::LossFunction<double> loss(task.model, c.loss, task.shape, all, all);
-  const auto loss_scratch = loss.MakeScratch();
+  auto loss_scratch = loss.MakeScratch();
   for (int m = 0; m < 2; ++m) {
-    loss.Gradient(parameters.data(), task.context, gradient.data(), loss_scratch);
+    loss.Gradient(parameters.data(), task.context, gradient.data(), &loss_scratch);
     for (size_t i = 0; i < parameters.size(); ++i) parameters[i] -= 0.1 * gradient[i];
   }
-  loss.Gradient(parameters.data(), task.target, gradient.data(), loss_scratch);
+  loss.Gradient(parameters.data(), task.target, gradient.data(), &loss_scratch);
   EXPECT_EQ(result, gradient);
 }
 

@@ -45,7 +45,8 @@ TEST(ProximalFitTest, TheCostIsTheLossAndThePullForEveryKindOfModel) {
   for (const nssm::ModelCase& c : nssm::ModelCases()) {
     Task task(c, "*");
     const MapFit fit = task.Fit({.proximal = 3, .steps = 2});
-    const double loss = task.loss->Value(task.At(fit.unknowns).data(), task.data, task.loss->MakeScratch());
+    auto scratch = task.loss->MakeScratch();
+    const double loss = task.loss->Value(task.At(fit.unknowns).data(), task.data, &scratch);
     const double distance = (fit.unknowns - GatherAdapted(*task.problem, task.start)).norm();
     EXPECT_NEAR(fit.cost, loss + 1.5 * distance * distance, 1e-12 * fit.cost) << c.name;
   }
@@ -61,7 +62,8 @@ TEST(ProximalFitTest, TheMinimumIsStationaryForEveryKindOfModel) {
       const MapFit fit = task.Fit({.proximal = 2, .steps = 60});
       EXPECT_TRUE(fit.converged) << c.name;
       std::vector<double> gradient(task.start.size());
-      task.loss->Gradient(task.At(fit.unknowns).data(), task.data, gradient.data(), task.loss->MakeScratch());
+      auto scratch = task.loss->MakeScratch();
+      task.loss->Gradient(task.At(fit.unknowns).data(), task.data, gradient.data(), &scratch);
       const VectorXd pull = 2 * (fit.unknowns - GatherAdapted(*task.problem, task.start));
       const double rest = (GatherAdapted(*task.problem, gradient) + pull).norm() / pull.norm();
       EXPECT_LT(rest, 1e-3) << c.name << ", mask " << mask;

@@ -27,7 +27,7 @@ std::vector<double> HiddenUnit(const BlockSpec& spec, double beta) {
   const int32_t count = static_cast<int32_t>(std::size(kPoints));
   const autodiff::Value value = block.Apply(&graph, bound, graph.Input(1, 0, 1, count));
   const autodiff::Executable<double> program(autodiff::Compile(graph, {{value, 2}}));
-  autodiff::Arena<double> arena{&program};
+  autodiff::Arena<double> arena({&program});
   std::vector<double> values(std::size(kPoints));
   autodiff::Slots<double> slots;
   slots.Input(0, parameters.data()).Input(1, kPoints).Output(2, values.data());

@@ -35,17 +35,17 @@ TEST(LossTest, GradientsMatchCentralDifferencesForEveryKindOfModel) {
     SCOPED_TRACE(c.name);
     const Problem p = MakeProblem(c);
     const LossFunction<double> loss(p.model, c.loss, p.shape, All(p.model), All(p.model));
-    const auto scratch = loss.MakeScratch();
+    auto scratch = loss.MakeScratch();
     std::vector<double> gradient(p.parameters.size());
-    const double value = loss.Gradient(p.parameters.data(), p.data, gradient.data(), scratch);
-    EXPECT_DOUBLE_EQ(value, loss.Value(p.parameters.data(), p.data, scratch));
+    const double value = loss.Gradient(p.parameters.data(), p.data, gradient.data(), &scratch);
+    EXPECT_DOUBLE_EQ(value, loss.Value(p.parameters.data(), p.data, &scratch));
     const double h = 1e-5;
     for (size_t i = 0; i < gradient.size(); ++i) {
       std::vector<double> moved = p.parameters;
       moved[i] += h;
-      const double up = loss.Value(moved.data(), p.data, scratch);
+      const double up = loss.Value(moved.data(), p.data, &scratch);
       moved[i] -= 2 * h;
-      const double down = loss.Value(moved.data(), p.data, scratch);
+      const double down = loss.Value(moved.data(), p.data, &scratch);
       EXPECT_NEAR(gradient[i], (up - down) / (2 * h), 1e-7 * (1 + Norm(gradient))) << "parameter " << i;
     }
   }
@@ -56,17 +56,17 @@ TEST(LossTest, HessianVectorProductsMatchCentralDifferencesOfTheGradient) {
     SCOPED_TRACE(c.name);
     const Problem p = MakeProblem(c);
     const LossFunction<double> loss(p.model, c.loss, p.shape, All(p.model), All(p.model));
-    const auto scratch = loss.MakeScratch();
+    auto scratch = loss.MakeScratch();
     const size_t n = p.parameters.size();
     base::Rng rng(1);
     std::vector<double> v(n), product(n), up(n), down(n), moved(n);
     for (double& value : v) value = rng.Normal();
-    loss.HessianVector(p.parameters.data(), p.data, v.data(), product.data(), scratch);
+    loss.HessianVector(p.parameters.data(), p.data, v.data(), product.data(), &scratch);
     const double h = 1e-5;
     for (size_t i = 0; i < n; ++i) moved[i] = p.parameters[i] + h * v[i];
-    loss.Gradient(moved.data(), p.data, up.data(), scratch);
+    loss.Gradient(moved.data(), p.data, up.data(), &scratch);
     for (size_t i = 0; i < n; ++i) moved[i] = p.parameters[i] - h * v[i];
-    loss.Gradient(moved.data(), p.data, down.data(), scratch);
+    loss.Gradient(moved.data(), p.data, down.data(), &scratch);
     for (size_t i = 0; i < n; ++i) {
       EXPECT_NEAR(product[i], (up[i] - down[i]) / (2 * h), 1e-7 * (1 + Norm(product))) << "parameter " << i;
     }
@@ -80,8 +80,9 @@ TEST(LossTest, AMaskedGradientIsTheFullOneRestricted) {
   const LossFunction<double> full(p.model, c.loss, p.shape, All(p.model), All(p.model));
   const LossFunction<double> masked(p.model, c.loss, p.shape, mask, mask);
   std::vector<double> a(p.parameters.size()), b(p.parameters.size(), 1);
-  full.Gradient(p.parameters.data(), p.data, a.data(), full.MakeScratch());
-  masked.Gradient(p.parameters.data(), p.data, b.data(), masked.MakeScratch());
+  auto scratch = full.MakeScratch(), masked_scratch = masked.MakeScratch();
+  full.Gradient(p.parameters.data(), p.data, a.data(), &scratch);
+  masked.Gradient(p.parameters.data(), p.data, b.data(), &masked_scratch);
   for (size_t i = 0; i < mask.size(); ++i) {
     const nn::Tensor& tensor = p.model.layout().tensors()[i];
     for (int64_t k = tensor.offset; k < tensor.offset + tensor.size(); ++k) {
@@ -128,7 +129,55 @@ TEST(LossTest, ALinearCaseTwoLossEqualsItsDefinition) {
   ASSERT_EQ(rollouts, p.shape.rollouts);
   const double expected = 5 * recon / (2 * rollouts) + 3 * state / (4 * rollouts) + 2 * output / (2 * rollouts);
   const LossFunction<double> function(p.model, loss, p.shape, All(p.model), All(p.model));
-  EXPECT_NEAR(function.Value(p.parameters.data(), p.data, function.MakeScratch()), expected, 1e-12 * expected);
+  auto scratch = function.MakeScratch();
+  EXPECT_NEAR(function.Value(p.parameters.data(), p.data, &scratch), expected, 1e-12 * expected);
+}
+
+/// A model and a set large enough to be cut into blocks, of rollouts that do not divide evenly.
+Problem LargeProblem(const LossSpec& loss) {
+  ModelSpec spec{.kind = Case::kStateInputOutput, .input_size = 2, .output_size = 1, .state_size = 3, .latent_size = 8, .window = 1};
+  spec.encoder.hidden_widths = {200, 200};
+  spec.transition.block.hidden_widths = {30};
+  return MakeProblem({"large", spec, loss}, 103);
+}
+
+/// [L, ∇L, H v] by any number of threads.
+std::vector<double> Everything(const Problem& p, const LossSpec& loss, const LossShape& shape, const LossData<double>& data, size_t threads) {
+  const auto executor = base::MakeThreadExecutor(threads);
+  const nn::Mask mask = *nn::ParseMask("encoder,transition", p.model.layout());
+  const LossFunction<double> function(p.model, loss, shape, mask, All(p.model));
+  auto scratch = function.MakeScratch(executor.get());
+  const size_t n = p.parameters.size();
+  std::vector<double> v(n), all(1 + 2 * n);
+  base::Rng rng(5);
+  for (double& value : v) value = rng.Normal();
+  all[0] = function.Gradient(p.parameters.data(), data, &all[1], &scratch);
+  EXPECT_EQ(all[0], function.Value(p.parameters.data(), data, &scratch));
+  function.HessianVector(p.parameters.data(), data, v.data(), &all[1 + n], &scratch);
+  return all;
+}
+
+TEST(LossTest, LargeLossesAreTheSameWhateverTheNumberOfThreads) {
+  const LossSpec loss{.horizon = 2, .rollout = RolloutMode::kState, .stride = 1};
+  const Problem p = LargeProblem(loss);
+  const std::vector<double> serial = Everything(p, loss, p.shape, p.data, 1);
+  for (const size_t threads : {2, 3, 8}) EXPECT_EQ(Everything(p, loss, p.shape, p.data, threads), serial) << threads;
+}
+
+// A mean over rollouts is the mean of what each has: single rollouts are never cut.
+TEST(LossTest, LargeLossesAreTheMeanOfTheirRollouts) {
+  const LossSpec loss{.horizon = 2, .rollout = RolloutMode::kState, .stride = 1};
+  const Problem p = LargeProblem(loss);
+  const std::vector<double> whole = Everything(p, loss, p.shape, p.data, 2);
+  const data::Trajectory trajectory = RandomTrajectory(p.model.spec(), 105, 3);  // what MakeProblem cuts from
+  std::vector<double> mean(whole.size());
+  for (int32_t j = 0; j < p.shape.rollouts; ++j) {
+    const LossShape one{1, p.shape.horizon};
+    const auto data = CutLossData<double>(p.model.spec(), loss, trajectory, 1 + j, one);
+    const std::vector<double> own = Everything(p, loss, one, data, 1);
+    for (size_t i = 0; i < mean.size(); ++i) mean[i] += own[i] / p.shape.rollouts;
+  }
+  for (size_t i = 0; i < mean.size(); ++i) ASSERT_NEAR(whole[i], mean[i], 1e-12 * (1 + Norm(mean))) << i;
 }
 
 TEST(LossTest, TooFewSamplesAreRefusedWithTheNumberNeeded) {
@@ -146,8 +195,9 @@ TEST(LossTest, FloatAgreesWithDouble) {
   const LossFunction<float> narrow(p.model, c.loss, p.shape, All(p.model), All(p.model));
   const std::vector<float> parameters(p.parameters.begin(), p.parameters.end());
   const LossData<float> data = CutLossData<float>(c.model, c.loss, RandomTrajectory(c.model, 11, 3), 1, p.shape);
-  EXPECT_NEAR(narrow.Value(parameters.data(), data, narrow.MakeScratch()),
-              wide.Value(p.parameters.data(), p.data, wide.MakeScratch()), 1e-5);
+  auto narrow_scratch = narrow.MakeScratch();
+  auto wide_scratch = wide.MakeScratch();
+  EXPECT_NEAR(narrow.Value(parameters.data(), data, &narrow_scratch), wide.Value(p.parameters.data(), p.data, &wide_scratch), 1e-5);
 }
 
 }  // namespace
