@@ -166,9 +166,11 @@ void InnerLoop<T>::PullBack(const std::vector<double>& rates, HessianVector hess
     StepAdjoint(m, rates, adjoint, trace, rate_adjoint);
     hessian_vector(trace->At(trace->iterates_, m - 1), trace->direction_.data(), trace->product_.data());
     const T* product = trace->product_.data();
-    nn::ForParts({{0, size_}}, trace->executor_, [&](size_t, int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) adjoint[i] -= product[i];
-    });
+    for (const nn::Pieces* pieces : {&adapted_, &frozen_}) {
+      nn::ForParts(*pieces, trace->executor_, [&](size_t, int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; ++i) adjoint[i] -= product[i];
+      });
+    }
   }
 }
 

@@ -31,7 +31,8 @@ enum class InnerRecord {
 /// With a pull λ it minimises L + ½ λ |ω − ω₀|². Gradient descent takes the pull implicitly, at ω_m, so that no λ
 /// makes it unstable: ω_m = ω₀ + (ω_{m−1} − β d_m − ω₀)/(1 + β λ), whose rest is the minimum. Adam adds λ (ω − ω₀) to g.
 ///
-/// Immutable and safe to share; each thread brings a Trace. No call allocates.
+/// Immutable and safe to share; each thread brings a Trace. No call allocates, but for what it takes to
+/// hand the steps of a large model to threads.
 /// Source: paper.tex eqs. maml_inner, anil_inner; the pull is that of A. Rajeswaran et al., Meta-Learning with Implicit
 /// Gradients, 2019, its implicit step ours.
 template <typename T>

@@ -54,7 +54,7 @@ LossData<T> CutLossData(const ModelSpec& model, const LossSpec& loss, const data
 /// Only the parameters of the mask are differentiated; elements of the others are zero in a gradient.
 /// Where a large model meets many samples, rollouts are cut into blocks that run side by side on the scratch's executor and are summed
 /// in order. Blocks depend on sizes alone, so results do not depend on the number of threads.
-/// Compiled once, then safe to call concurrently with a scratch each. No call allocates.
+/// Compiled once, then safe to call concurrently with a scratch each. No call allocates, but for what it takes to hand blocks to threads.
 /// Source: paper.tex eqs. nssm-loss-fn-1, nssm-loss-fn-2; the output path of Case II is the filter's h (eq. h_bar).
 template <typename T>
 class LossFunction {

@@ -34,8 +34,7 @@ double MedianSeconds(int repeats, const std::function<void()>& work) {
     work();
     seconds.push_back(std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count());
   }
-  std::nth_element(seconds.begin(), seconds.begin() + repeats / 2, seconds.end());
-  return seconds[static_cast<size_t>(repeats / 2)];
+  return benchmark::Median(std::move(seconds));
 }
 
 /// The paper's localisation network: states (p_X, p_Y, heading), three inputs, the magnetic field as a gradient.
