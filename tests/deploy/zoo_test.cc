@@ -2,6 +2,7 @@
 #include <gtest/gtest.h>
 
 #include <algorithm>
+#include <cmath>
 #include <filesystem>
 #include <fstream>
 #include <sstream>
@@ -124,6 +125,31 @@ TEST(ZooTest, LocalizationFollowsVehiclesAndSaysHowWell) {
   EXPECT_LT(errors[errors.size() / 2], 208.0 / 3);  // 208: dead reckoning with the true geometry (core/experiments/README.md)
   EXPECT_GT(held, 0.9);
   EXPECT_LT(held, 0.99);
+}
+
+/// Root mean square error of the states in their deviations over the fleet, behind the context.
+double RelativeError(const nssm::Bundle& bundle, const experiments::FilterRun& run, const Trajectory& truth) {
+  const Eigen::VectorXd inverse = bundle.normaliser.states.scale.cwiseInverse();
+  const Eigen::MatrixXd off = inverse.asDiagonal() * (run.means - truth.states.rightCols(run.means.cols()));
+  return std::sqrt(off.squaredNorm() / static_cast<double>(off.size()));
+}
+
+TEST(ZooTest, VaporCompressionGainsByAdaptingAndKeepsPressuresInOrder) {
+  constexpr int64_t kContext = 200;
+  const auto bundle = nssm::ReadModelFile(Contents(kZoo + "/vapor-compression.safetensors"));
+  ASSERT_TRUE(bundle.ok()) << bundle.status();
+  const std::shared_ptr<const filter::FilterModel> functions = filter::FilterModel::Create(*bundle);
+  const Trajectory cycle =
+      Simulated("vapor-compression", 4242, 700, {{"pressure_noise_std", "1000"}, {"temperature_noise_std", "0.1"}});
+  const auto adapted = experiments::AdaptForFilter(*bundle, cycle, kContext);
+  ASSERT_TRUE(adapted.ok()) << adapted.status();
+  const auto with = experiments::FilterAfterContext(*adapted, functions, cycle, kContext);
+  const auto without = experiments::FilterAfterContext(*bundle, functions, cycle, kContext);
+  ASSERT_TRUE(with.ok()) << with.status();
+  ASSERT_TRUE(without.ok()) << without.status();
+  EXPECT_LT(RelativeError(*bundle, *with, cycle), RelativeError(*bundle, *without, cycle) / 2);
+  const Eigen::MatrixXd rise = with->means.middleRows(1, 7) - with->means.topRows(7);  // along the flow, Pa
+  EXPECT_LE(rise.maxCoeff(), 0);
 }
 
 }  // namespace
