@@ -15,14 +15,13 @@
 #include "core/base/json_fields.h"
 #include "core/filter/ekf.h"
 #include "core/meta/meta_gradient.h"
+#include "tests/benchmark/networks.h"
 #include "tests/benchmark/report.h"
 #include "tests/core/nssm/random_models.h"
 #include "tests/support/bundles.h"
 
 namespace metaekf {
 namespace {
-
-using autodiff::Activation;
 
 constexpr int kRounds = 3;  // beside a peer
 
@@ -37,23 +36,8 @@ double MedianSeconds(int repeats, const std::function<void()>& work) {
   return benchmark::Median(std::move(seconds));
 }
 
-/// The paper's localisation network: states (p_X, p_Y, heading), three inputs, the magnetic field as a gradient.
-nssm::ModelSpec LocalisationSpec() {
-  const auto block = [](std::vector<int32_t> widths) {
-    return nn::BlockSpec{.hidden_widths = std::move(widths), .activation = Activation::kSwish};
-  };
-  nssm::ModelSpec spec{.kind = nssm::Case::kStateInputOutput, .input_size = 3, .output_size = 2, .state_size = 3, .latent_size = 128, .window = 1};
-  spec.encoder = block({256, 128, 128, 64, 32, 32});
-  spec.transition.block = block({256, 256, 256, 256, 256, 256});
-  spec.transition.form = nssm::TransitionForm::kAutonomous;
-  spec.state_decoder = block({32, 64, 128, 256});
-  spec.output_decoder = block({64, 64, 128, 128, 256, 256});
-  spec.curl_free_positions = {0, 1};
-  return spec;
-}
-
 double EkfStepSeconds() {
-  nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(LocalisationSpec()));
+  nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(benchmark::LocalisationSpec()));
   bundle.parameters = bundle.model.InitialParameters(1);
   const std::shared_ptr<filter::FilterModel> model = filter::FilterModel::Create(bundle);
   filter::Ekf ekf = *filter::Ekf::Create(bundle, model, model->Prepare(bundle.parameters), {});
@@ -71,7 +55,7 @@ struct MetaSeconds {
 MetaSeconds LocalisationLearning() {
   constexpr int kSamples = 81;  // 80 one-step predictions
   constexpr int kSteps = 10;
-  const nssm::ModelSpec spec = LocalisationSpec();
+  const nssm::ModelSpec spec = benchmark::LocalisationSpec();
   const nssm::Model model = *nssm::Model::Create(spec);
   const nssm::LossSpec loss{.horizon = 1, .rollout = nssm::RolloutMode::kState};
   const nssm::LossShape shape = *nssm::ShapeOfLoss(spec, loss, kSamples);
@@ -107,12 +91,8 @@ MetaSeconds LocalisationLearning() {
   return seconds;
 }
 
-/// Latent 3, transition 4-16-3 with a skip, linear output: 134 parameters with the linear start that the peer leaves out.
 double SmallRolloutSeconds() {
-  nssm::ModelSpec spec{.kind = nssm::Case::kInputOutput, .input_size = 1, .output_size = 1, .state_size = 0, .latent_size = 3, .window = 1};
-  spec.transition.block = {.hidden_widths = {16}, .output_scale = 0.01};
-  spec.transition.bypass = nssm::Bypass::kSkip;
-  spec.output_decoder.bias = false;
+  const nssm::ModelSpec spec = benchmark::SmallSpec();
   const nssm::Model model = *nssm::Model::Create(spec);
   const nssm::LossSpec loss{.horizon = nssm::LossSpec::kWholeSet, .state_weight = 0, .reconstruction_weight = 0};
   const nssm::LossShape shape = *nssm::ShapeOfLoss(spec, loss, 4097);

@@ -1,0 +1,137 @@
+// Runs one hot path by name, for callgrind to count its instructions (check_instruction_counts).
+
+#include <cstdio>
+#include <fstream>
+#include <functional>
+#include <map>
+#include <sstream>
+#include <string>
+
+#include "core/base/executor.h"
+#include "core/data/split.h"
+#include "core/filter/ekf.h"
+#include "core/meta/adapt.h"
+#include "core/nssm/model_file.h"
+#include "core/sim/simulate.h"
+#include "server/session/session.h"
+#include "tests/benchmark/networks.h"
+#include "tests/core/nssm/random_models.h"
+#include "tests/support/bundles.h"
+
+/// What callgrind counts: it collects inside the function of this name only.
+extern "C" [[gnu::noipa]] void MeasuredHotPath(const std::function<void()>& work) { work(); }
+
+namespace metaekf {
+namespace {
+
+nssm::Bundle ZooModel(const std::string& name) {
+  std::ifstream file(METAEKF_SOURCE_DIR "/deploy/zoo/" + name + ".safetensors", std::ios::binary);
+  std::ostringstream bytes;
+  bytes << file.rdbuf();
+  return nssm::ReadModelFile(bytes.str()).value();
+}
+
+data::Trajectory Simulated(const std::string& system, int64_t steps, const std::map<std::string, std::string>& settings) {
+  const auto executor = base::MakeThreadExecutor(1);
+  return sim::Simulate({.system = system, .systems = 1, .seed = 1, .steps = steps, .settings = settings}, *executor)
+      .value()
+      .dataset.trajectories[0];
+}
+
+void Steps(const nssm::Bundle& bundle, int count) {
+  const std::shared_ptr<const filter::FilterModel> model = filter::FilterModel::Create(bundle);
+  filter::Ekf ekf = filter::Ekf::Create(bundle, model, model->Prepare(bundle), {}).value();
+  const auto scratch = model->MakeScratch();
+  filter::Estimate estimate = ekf.MakeEstimate();
+  const Eigen::VectorXd u = Eigen::VectorXd::Constant(ekf.input_size(), 0.3), y = Eigen::VectorXd::Constant(ekf.output_size(), 0.1);
+  const auto step = [&] { (void)ekf.Step(u, y, scratch.get(), &estimate); };
+  step();  // the first has no time update
+  MeasuredHotPath([&] {
+    for (int i = 0; i < count; ++i) step();
+  });
+}
+
+void SmallStep() { Steps(ZooModel("van-der-pol"), 200); }
+
+void LargeStep() {
+  nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(benchmark::LocalisationSpec()));
+  bundle.parameters = bundle.model.InitialParameters(1);
+  Steps(bundle, 4);
+}
+
+void RolloutGradient() {
+  constexpr int64_t kSamples = 513;
+  const nssm::ModelSpec spec = benchmark::SmallSpec();
+  const nssm::Model model = *nssm::Model::Create(spec);
+  const nssm::LossSpec loss{.horizon = nssm::LossSpec::kWholeSet, .state_weight = 0, .reconstruction_weight = 0};
+  const nssm::LossShape shape = *nssm::ShapeOfLoss(spec, loss, kSamples);
+  const auto data = nssm::CutLossData<float>(spec, loss, nssm::RandomTrajectory(spec, kSamples, 1), 0, shape);
+  const nn::Mask mask = *nn::ParseMask("transition,output_decoder", model.layout());
+  const nssm::LossFunction<float> function(model, loss, shape, mask, mask);
+  auto scratch = function.MakeScratch();
+  const std::vector<double> initial = model.InitialParameters(1);
+  const std::vector<float> parameters(initial.begin(), initial.end());
+  std::vector<float> gradient(parameters.size());
+  const auto compute = [&] { function.Gradient(parameters.data(), data, gradient.data(), &scratch); };
+  compute();
+  MeasuredHotPath(compute);
+}
+
+/// Exact second-order fits under the learned prior.
+void Adaptation() {
+  const nssm::Bundle bundle = ZooModel("bouc-wen");
+  const data::Trajectory context = Simulated("bouc-wen", 100, {{"nominal", "1"}, {"noise_std", "7.5e-6"}});
+  const auto spec = meta::DefaultAdaptation(bundle).value();
+  MeasuredHotPath([&] { (void)meta::AdaptedBundle(bundle, context, spec).value(); });
+}
+
+/// A batch of a stream, from the bytes of its request to those of its response.
+void EstimateBatch() {
+  constexpr int kBatch = 64;
+  auto model = std::make_shared<server::ServedModel>(server::ServedModel{.bundle = ZooModel("van-der-pol")});
+  model->filter_model = filter::FilterModel::Create(model->bundle);
+  model->filter_parameters = model->filter_model->Prepare(model->bundle);
+  const auto scratch = model->filter_model->MakeScratch();
+  v1::OpenSession open;
+  open.set_covariance_format(v1::OpenSession::DIAGONAL);
+  const auto session = server::Session::Open(model, open).value();
+  uint64_t next = 1;
+  const auto apply = [&] {
+    v1::EstimateRequest request;
+    request.mutable_samples()->set_first_seq(next);
+    for (int i = 0; i < 2 * kBatch; ++i) request.mutable_samples()->add_outputs(0.1);
+    const std::string bytes = request.SerializeAsString();
+    v1::EstimateRequest received;
+    v1::EstimateResponse response;
+    if (!received.ParseFromString(bytes) ||
+        !session->Apply(received.samples(), scratch.get(), response.mutable_estimates()).ok()) {
+      std::exit(1);
+    }
+    (void)response.SerializeAsString();
+    next += kBatch;
+  };
+  apply();
+  MeasuredHotPath(apply);
+}
+
+int Main(const std::string& name) {
+  const std::map<std::string, std::function<void()>> paths = {{"ekf-step-small", SmallStep},
+                                                              {"ekf-step-large", LargeStep},
+                                                              {"rollout-gradient", RolloutGradient},
+                                                              {"adaptation", Adaptation},
+                                                              {"estimate-batch", EstimateBatch}};
+  const auto path = paths.find(name);
+  if (path == paths.end()) {
+    std::fprintf(stderr, "usage: hot_paths NAME, which is one of");
+    for (const auto& [known, run] : paths) std::fprintf(stderr, " %s", known.c_str());
+    std::fprintf(stderr, "\n");
+    return 2;
+  }
+  path->second();
+  return 0;
+}
+
+}  // namespace
+}  // namespace metaekf
+
+int main(int argc, char** argv) { return metaekf::Main(argc == 2 ? argv[1] : ""); }
