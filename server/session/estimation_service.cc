@@ -129,10 +129,6 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
       has_request_ = false;
       request_.Swap(&work_);
       working_ = true;
-      if (!half_closed_) {
-        reading_ = true;
-        StartRead(&request_);
-      }
       StartWork();
       return;
     }
@@ -141,27 +137,30 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
                            : absl::OkStatus());
       return Advance();
     }
-    if (!reading_ && !has_request_ && !half_closed_) {
-      reading_ = true;
-      StartRead(&request_);
-    }
+    Read();
   }
 
   /// With mutex_ held and working_ set.
   void StartWork() {
-    bool accepted = true;
-    if (live_ == nullptr) {
-      accepted = service_.io_.Submit([this] { Work([this] { return OpenOrResume(); }); });
-    } else if (ValuesOf(work_) * time_per_value_ > kLongReaction) {
-      accepted = service_.heavy_.Submit([this] { Work([this] { return Apply(); }); });
-    } else {
-      // The batch is short: applied in this reaction, but without the mutex, which the caller holds.
+    if (live_ != nullptr && ValuesOf(work_) * time_per_value_ <= kLongReaction) {
+      // The batch is short: applied in this reaction, but without the mutex, which the caller holds. Reading on waits for the response
+      // to be on its way, which a single sensor's latency is made of.
       mutex_.unlock();
       const absl::Status status = Apply();
       mutex_.lock();
-      WorkDone(status);
+      return WorkDone(status);
     }
+    Read();
+    const bool accepted = live_ == nullptr ? service_.io_.Submit([this] { Work([this] { return OpenOrResume(); }); })
+                                           : service_.heavy_.Submit([this] { Work([this] { return Apply(); }); });
     if (!accepted) WorkDone(Overloaded());
+  }
+
+  /// With mutex_ held.
+  void Read() {
+    if (reading_ || has_request_ || half_closed_) return;
+    reading_ = true;
+    StartRead(&request_);
   }
 
   template <typename Function>

@@ -61,10 +61,10 @@ absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Open(const v1::Open
   // What is stored is the version that the name means now: a resumed session goes on with the same weights.
   v1::OpenSession settings = open;
   settings.set_target(model->adaptation.empty() ? model->model_version : model->adaptation);
-  METAEKF_RETURN_IF_ERROR(Session::Open(model, settings).status());
+  METAEKF_ASSIGN_OR_RETURN(std::unique_ptr<Session> session, Session::Open(model, settings));
   METAEKF_ASSIGN_OR_RETURN(const store::NewSession made,
                            store_.sessions().Create(settings.target(), settings.SerializeAsString()));
-  return Attach(made.session, settings, made.token);
+  return Attach(made.session, made.token, std::move(session), model->filter_model);
 }
 
 absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Resume(const v1::ResumeSession& resume) {
@@ -74,26 +74,27 @@ absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Resume(const v1::Re
   METAEKF_ASSIGN_OR_RETURN(const store::Session stored, store_.sessions().Claim(number, resume.token()));
   v1::OpenSession settings;
   if (!settings.ParseFromString(stored.settings)) return absl::DataLossError("the session's settings are damaged");
-  return Attach(stored, settings, "");
+  METAEKF_ASSIGN_OR_RETURN(const std::shared_ptr<const ServedModel> model, models_.Get("target", settings.target()));
+  METAEKF_ASSIGN_OR_RETURN(std::unique_ptr<Session> session, Session::Open(model, settings));
+  if (!stored.checkpoint.empty()) {
+    const std::shared_ptr<ScratchPool> pool = PoolOf(model->filter_model);
+    std::unique_ptr<filter::FilterModel::Scratch> scratch = pool->Take();
+    const absl::Status restored = session->Restore(stored.checkpoint, scratch.get());
+    pool->GiveBack(std::move(scratch));
+    METAEKF_RETURN_IF_ERROR(restored);
+  }
+  return Attach(stored, "", std::move(session), model->filter_model);
 }
 
-absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Attach(const store::Session& stored,
-                                                                    const v1::OpenSession& settings,
-                                                                    const std::string& token) {
-  METAEKF_ASSIGN_OR_RETURN(const std::shared_ptr<const ServedModel> model, models_.Get("target", settings.target()));
+std::shared_ptr<LiveSession> SessionManager::Attach(const store::Session& stored, const std::string& token, std::unique_ptr<Session> session,
+                                                    const std::shared_ptr<const filter::FilterModel>& model) {
   auto live = std::make_shared<LiveSession>();
   live->number = stored.number;
   live->epoch = static_cast<uint64_t>(stored.epoch);
   live->token = token;
   live->durable_seq = static_cast<uint64_t>(stored.durable_seq);
-  METAEKF_ASSIGN_OR_RETURN(live->session, Session::Open(model, settings));
-  live->scratch = PoolOf(model->filter_model);
-  if (!stored.checkpoint.empty()) {
-    std::unique_ptr<filter::FilterModel::Scratch> scratch = live->scratch->Take();
-    const absl::Status restored = live->session->Restore(stored.checkpoint, scratch.get());
-    live->scratch->GiveBack(std::move(scratch));
-    METAEKF_RETURN_IF_ERROR(restored);
-  }
+  live->session = std::move(session);
+  live->scratch = PoolOf(model);
   std::shared_ptr<LiveSession> before;
   {
     std::lock_guard lock(mutex_);

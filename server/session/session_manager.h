@@ -66,8 +66,9 @@ class SessionManager {
   absl::Status Delete(const std::string& name);
 
  private:
-  absl::StatusOr<std::shared_ptr<LiveSession>> Attach(const store::Session& stored, const v1::OpenSession& settings,
-                                                      const std::string& token);
+  /// Puts a session behind its stream, and tells the stream that had it before.
+  std::shared_ptr<LiveSession> Attach(const store::Session& stored, const std::string& token, std::unique_ptr<Session> session,
+                                      const std::shared_ptr<const filter::FilterModel>& model);
   std::shared_ptr<ScratchPool> PoolOf(const std::shared_ptr<const filter::FilterModel>& model);
   v1::Session ToMessage(const store::Session& stored);
   void RunCheckpoints();

@@ -28,6 +28,7 @@ class WorkerProcess {
   bool ended() const { return ended_; }
 
   void Signal(int signal);
+  pid_t pid() const { return pid_; }
 
   struct Exit {
     int code = 0;    ///< if signal is 0

@@ -1,210 +1,89 @@
 // See README.md beside this file.
 
-#include <grpcpp/grpcpp.h>
-#include <signal.h>
 #include <unistd.h>
 
 #include <algorithm>
+#include <atomic>
 #include <chrono>
 #include <cmath>
-#include <condition_variable>
+#include <csignal>
 #include <cstdio>
+#include <cstring>
 #include <filesystem>
 #include <fstream>
 #include <functional>
-#include <mutex>
+#include <limits>
+#include <map>
+#include <memory>
 #include <sstream>
 #include <string>
 #include <thread>
 #include <vector>
 
-#include "echo.grpc.pb.h"
-#include "metaekf/client.h"
-#include "metaekf/v1/estimation.pb.h"
-#include "server/training/worker_process.h"
+#include "core/base/executor.h"
+#include "core/sim/simulate.h"
 #include "tests/benchmark/report.h"
+#include "tests/benchmark/streams.h"
+#include "tests/server/support/server_process.h"
 
 namespace metaekf::benchmark {
 namespace {
 
+using server::ServerProcess;
 using std::chrono::steady_clock;
 
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
-constexpr size_t kOutputs = 2;         // of the van der Pol model, which has no inputs and two states
 constexpr int kMessagesInFlight = 8;
 constexpr int kRounds = 5;
 constexpr int kBatch = 64;
 constexpr double kSecondsPerRound = 1;
-constexpr int kSamplesAt100Hz = 300;   // of a round
+constexpr int kSamplesAt100Hz = 300;  // of a round
+constexpr int kModels = 1000;         // of a large registry
+constexpr size_t kSessionsPerConnection = 100;
+constexpr size_t kSessions[] = {10, 100, 1000, 5000};
+constexpr uint32_t kContext = 400;
 
-[[noreturn]] void Fail(const std::string& what) {
-  std::fprintf(stderr, "service_benchmark: %s\n", what.c_str());
-  std::exit(1);
+std::string Contents(const std::string& path) {
+  std::ifstream file(path, std::ios::binary);
+  if (!file) Fail(path + " cannot be read");
+  std::ostringstream bytes;
+  bytes << file.rdbuf();
+  return bytes.str();
 }
 
-void Check(const client::Status& status, const std::string& what) {
-  if (!status.ok()) Fail(what + ": " + status.message);
+std::string ZooModel() { return Contents(METAEKF_SOURCE_DIR "/deploy/zoo/van-der-pol.safetensors"); }
+
+/// The same model with a last number of its own, so that no two files are the same.
+std::string ZooModel(int number) {
+  std::string file = ZooModel();
+  const double weight = 1e-3 * (number + 1);
+  std::memcpy(file.data() + file.size() - sizeof(weight), &weight, sizeof(weight));
+  return file;
 }
 
-/// A server of its own process.
-class Server {
+double SecondsSince(steady_clock::time_point begin) { return std::chrono::duration<double>(steady_clock::now() - begin).count(); }
+
+/// Does something again and again in a thread of its own for as long as it lives.
+class Beside {
  public:
-  Server(const std::string& binary, const std::vector<std::string>& arguments)
-      : process_(server::WorkerProcess::Start(binary, arguments).value()) {
-    const std::string prefix = "listening on ";
-    const auto line = process_.ReadLine(absl::Seconds(30), /*wake_fd=*/-1);
-    if (!line || line->rfind(prefix, 0) != 0) Fail(binary + " does not start");
-    address_ = line->substr(prefix.size());
+  Beside(std::chrono::milliseconds pause, std::function<void()> work)
+      : thread_([this, pause, work = std::move(work)] {
+          for (auto next = steady_clock::now(); !stop_; std::this_thread::sleep_until(next)) {
+            next += pause;
+            work();
+            ++done_;
+          }
+        }) {}
+  ~Beside() {
+    stop_ = true;
+    thread_.join();
   }
-  ~Server() {
-    process_.Signal(SIGTERM);
-    process_.Wait();
-  }
-  const std::string& address() const { return address_; }
+  int done() const { return done_; }
 
  private:
-  server::WorkerProcess process_;
-  std::string address_;
-};
-
-/// A message there and one back, at most `in_flight` of them at a time. @return messages per second.
-/// @param send  the next message. @param receive  waits for one.
-double MessagesPerSecond(int in_flight, double seconds, const std::function<void()>& send, const std::function<void()>& receive) {
-  std::mutex mutex;
-  std::condition_variable changed;
-  int64_t sent = 0, received = 0;
-  bool stop = false;
-  std::thread sender([&] {
-    while (true) {
-      {
-        std::unique_lock lock(mutex);
-        changed.wait(lock, [&] { return stop || sent - received < in_flight; });
-        if (stop) return;
-        ++sent;
-      }
-      send();
-    }
-  });
-  const auto take = [&] {
-    receive();
-    std::lock_guard lock(mutex);
-    ++received;
-    changed.notify_one();
-  };
-  for (int i = 0; i < 200; ++i) take();  // until everything is warm
-  const steady_clock::time_point begin = steady_clock::now();
-  int64_t count = 0;
-  double elapsed = 0;
-  for (; elapsed < seconds; ++count) {
-    take();
-    if (count % 32 == 0) elapsed = std::chrono::duration<double>(steady_clock::now() - begin).count();
-  }
-  elapsed = std::chrono::duration<double>(steady_clock::now() - begin).count();
-  int64_t left;
-  {
-    std::lock_guard lock(mutex);
-    stop = true;
-    changed.notify_one();
-  }
-  sender.join();
-  for (left = sent - received; left > 0; --left) receive();
-  return static_cast<double>(count) / elapsed;
-}
-
-/// Round trips at 100 Hz. @return of each, in µs.
-std::vector<double> LatenciesAt100Hz(const std::function<void()>& round_trip) {
-  std::vector<double> latencies;
-  steady_clock::time_point next = steady_clock::now();
-  for (int i = 0; i < kSamplesAt100Hz; ++i) {
-    next += std::chrono::milliseconds(10);
-    std::this_thread::sleep_until(next);
-    const steady_clock::time_point begin = steady_clock::now();
-    round_trip();
-    latencies.push_back(std::chrono::duration<double, std::micro>(steady_clock::now() - begin).count());
-  }
-  return latencies;
-}
-
-/// Sizes of messages on the wire.
-struct Sizes {
-  size_t request, response;
-};
-
-Sizes SizesOf(int samples) {
-  v1::EstimateRequest request;
-  request.mutable_samples()->set_first_seq(100'000);
-  v1::EstimateResponse response;
-  v1::EstimateBatch* batch = response.mutable_estimates();
-  batch->set_first_seq(100'000);
-  batch->set_durable_seq(100'000);
-  for (int i = 0; i < samples; ++i) {
-    for (size_t k = 0; k < kOutputs; ++k) {
-      request.mutable_samples()->add_outputs(0.1);
-      batch->add_means(0.1);
-      batch->add_covariances(0.1);
-    }
-    batch->add_times_s(0.1);
-    batch->add_nis(0.1);
-    batch->add_health(v1::EstimateBatch::CONSISTENT);
-    batch->add_flags(0);
-  }
-  return {request.ByteSizeLong(), response.ByteSizeLong()};
-}
-
-class EchoStream {
- public:
-  EchoStream(const std::string& address, const Sizes& sizes)
-      : stub_(Echo::NewStub(grpc::CreateChannel(address, grpc::InsecureChannelCredentials()))), stream_(stub_->Stream(&context_)) {
-    // A payload's tag and length take two bytes up to 127, and as many the number of bytes in the reply.
-    request_.mutable_payload()->resize(sizes.request > 4 ? sizes.request - 4 : 0);
-    request_.set_reply_bytes(static_cast<uint32_t>(sizes.response - 2));
-  }
-  ~EchoStream() {
-    context_.TryCancel();
-    stream_->Finish();
-  }
-  void Send() {
-    if (!stream_->Write(request_)) Fail("the echo has ended");
-  }
-  void Receive() {
-    if (!stream_->Read(&reply_)) Fail("the echo has ended");
-  }
-
- private:
-  std::unique_ptr<Echo::Stub> stub_;
-  grpc::ClientContext context_;
-  std::unique_ptr<grpc::ClientReaderWriter<EchoRequest, EchoReply>> stream_;
-  EchoRequest request_;
-  EchoReply reply_;
-};
-
-class EstimateStream {
- public:
-  EstimateStream(client::Client* client, int samples_per_message) {
-    client::EstimationOptions options;
-    options.target.model = "van-der-pol";
-    auto session = client->OpenEstimation(options);
-    Check(session.status(), "opening a session");
-    session_ = std::move(*session);
-    samples_.samples = static_cast<size_t>(samples_per_message);
-    samples_.outputs.assign(samples_.samples * kOutputs, 0);
-  }
-  void Send() {
-    for (size_t i = 0; i < samples_.samples; ++i, ++time_) {
-      samples_.outputs[kOutputs * i] = 2 * std::sin(0.01 * time_);
-      samples_.outputs[kOutputs * i + 1] = 2 * std::cos(0.01 * time_);
-    }
-    Check(session_->Send(samples_).status(), "sending");
-  }
-  void Receive() {
-    const auto batch = session_->Receive();
-    Check(batch.status(), "receiving");
-  }
-
- private:
-  std::unique_ptr<client::EstimationSession> session_;
-  client::SampleBatch samples_;
-  double time_ = 0;
+  std::atomic<bool> stop_ = false;
+  std::atomic<int> done_ = 0;
+  std::thread thread_;
 };
 
 template <class Stream>
@@ -227,44 +106,173 @@ std::vector<Row> Throughput(client::Client* client, const std::string& echo) {
           {"one stream, 64 samples a message, samples", "1/s", samples, messages, samples / messages, "stream_batch"}};
 }
 
+template <class Stream>
+void AddLatencies(Stream* stream, std::vector<double>* latencies) {
+  const std::vector<double> round = LatenciesAt100Hz(kSamplesAt100Hz, [&] { stream->Send(), stream->Receive(); });
+  latencies->insert(latencies->end(), round.begin(), round.end());
+}
+
+/// A fleet of van der Pol oscillators as the client sends it.
+std::vector<client::Trajectory> Oscillators(int64_t systems, int64_t steps) {
+  const auto executor = base::MakeThreadExecutor(1);
+  const auto fleet = sim::Simulate(
+      {.system = "van-der-pol", .systems = systems, .seed = 1, .steps = steps, .settings = {{"noise_std", "0.005"}}}, *executor);
+  if (!fleet.ok()) Fail(std::string(fleet.status().message()));
+  std::vector<client::Trajectory> result;
+  for (const data::Trajectory& from : fleet->dataset.trajectories) {
+    client::Trajectory to{.name = from.name, .sample_period_s = from.sample_period_s, .samples = static_cast<size_t>(from.outputs.cols())};
+    to.outputs.assign(from.outputs.data(), from.outputs.data() + from.outputs.size());
+    to.states.assign(from.states.data(), from.states.data() + from.states.size());
+    result.push_back(std::move(to));
+  }
+  return result;
+}
+
+/// Of a stream and of the echo: alone, while a training runs and adaptations follow each other, and while a model is loaded every second.
 std::vector<Row> Latency(client::Client* client, const std::string& echo) {
-  std::vector<double> echoed, estimated;
+  std::vector<double> alone, busy, loading, echo_alone, echo_busy, echo_loading;
+  client::TrainingRequest training{.model = "beside", .spec = Contents(METAEKF_SOURCE_DIR "/deploy/specs/van-der-pol.textproto"),
+                                   .channels = {.outputs = {{"y1", ""}, {"y2", ""}}, .states = {{"x1", ""}, {"x2", ""}}},
+                                   .fleet = Oscillators(50, 1000)};
+  client::AdaptationRequest adaptation;
+  adaptation.model = "van-der-pol";
+  adaptation.context = Oscillators(1, kContext)[0];
+  int adaptations = 0, loads = 0;
   for (int round = 0; round < kRounds; ++round) {
     EchoStream peer(echo, SizesOf(1));
     EstimateStream stream(client, 1);
-    const auto add = [](const std::vector<double>& from, std::vector<double>* to) { to->insert(to->end(), from.begin(), from.end()); };
-    add(LatenciesAt100Hz([&] { peer.Send(), peer.Receive(); }), &echoed);
-    add(LatenciesAt100Hz([&] { stream.Send(), stream.Receive(); }), &estimated);
+    AddLatencies(&peer, &echo_alone);
+    AddLatencies(&stream, &alone);
+    {
+      const auto job = client->CreateTrainingJob(training);
+      Check(job.status(), "training");
+      Check(client->WatchJob(job->id, [](const client::Job& now) { return now.state == client::JobState::kQueued; }).status(), "watching");
+      const Beside adapting(std::chrono::milliseconds(0), [&] { Check(client->Adapt(adaptation).status(), "adapting"); });
+      AddLatencies(&peer, &echo_busy);
+      AddLatencies(&stream, &busy);
+      adaptations += adapting.done();
+      const auto cancelled = client->CancelJob(job->id);
+      Check(cancelled.status(), "cancelling");
+    }
+    {
+      const Beside loader(std::chrono::seconds(1), [&] {
+        const std::string name = "loaded-" + std::to_string(loads++);
+        Check(client->ImportModel(name, ZooModel(loads)).status(), "importing");
+        { EstimateStream loaded(client, 1, name); }
+        Check(client->DeleteModelVersion(name + "@1"), "deleting");
+      });
+      AddLatencies(&peer, &echo_loading);
+      AddLatencies(&stream, &loading);
+    }
   }
   std::vector<Row> rows;
-  for (const auto& [name, share] : {std::pair{"p50", 0.5}, {"p99", 0.99}}) {
-    rows.push_back({std::string("one stream at 100 Hz, ") + name, "µs", Quantile(estimated, share), Quantile(echoed, share), kNaN, ""});
+  const auto add = [&rows](const std::string& what, const std::vector<double>& ours, const std::vector<double>& theirs) {
+    for (const auto& [name, share] : {std::pair{", p50", 0.5}, {", p99", 0.99}}) {
+      rows.push_back({what + name, "µs", Quantile(ours, share), Quantile(theirs, share), kNaN, ""});
+    }
+  };
+  add("one stream at 100 Hz", alone, echo_alone);
+  add("  beside a training and " + std::to_string(adaptations / kRounds) + " adaptations", busy, echo_busy);
+  add("  beside a model loaded every second", loading, echo_loading);
+  return rows;
+}
+
+double ResidentKib(pid_t pid) {
+  std::ifstream status("/proc/" + std::to_string(pid) + "/status");
+  for (std::string line; std::getline(status, line);) {
+    if (line.rfind("VmRSS:", 0) == 0) return std::stod(line.substr(6));
+  }
+  Fail("the server's memory cannot be read");
+}
+
+/// More and more sessions that take turns, as many messages in flight as before.
+std::vector<Row> Growth(const ServerProcess& server) {
+  std::vector<std::unique_ptr<client::Client>> connections;
+  std::vector<std::unique_ptr<EstimateStream>> streams;
+  std::vector<Row> rows;
+  double before_kib = 0;
+  size_t before = 0;
+  for (const size_t sessions : kSessions) {
+    std::vector<double> opening_ms;
+    while (streams.size() < sessions) {
+      if (streams.size() % kSessionsPerConnection == 0) {
+        connections.push_back(std::make_unique<client::Client>(client::Options{.server = server.address()}));
+        (void)connections.back()->GetServerInfo();  // connected
+      }
+      const steady_clock::time_point begin = steady_clock::now();
+      streams.push_back(std::make_unique<EstimateStream>(connections.back().get(), 1));
+      opening_ms.push_back(1e3 * SecondsSince(begin));
+    }
+    size_t next_out = 0, next_in = 0;
+    const auto turn = [&](size_t* next) { return streams[(*next)++ % streams.size()].get(); };
+    for (size_t i = 0; i < streams.size(); ++i) streams[i]->Send(), streams[i]->Receive();
+    const double kib = ResidentKib(server.pid());
+    std::vector<double> rates;
+    for (int round = 0; round < kRounds; ++round) {
+      rates.push_back(MessagesPerSecond(kMessagesInFlight, kSecondsPerRound, [&] { turn(&next_out)->Send(); }, [&] { turn(&next_in)->Receive(); }));
+      next_out = next_in = 0;
+    }
+    const std::string of = std::to_string(sessions) + " sessions, ";
+    rows.push_back({of + "estimates", "1/s", Median(rates), kNaN, kNaN, ""});
+    rows.push_back({of + "opening one", "ms", Median(opening_ms), kNaN, kNaN, ""});
+    if (before > 0) rows.push_back({of + "server memory of each more", "KiB", (kib - before_kib) / static_cast<double>(sessions - before), kNaN, kNaN, ""});
+    before = sessions;
+    before_kib = kib;
   }
   return rows;
 }
 
-std::string Contents(const std::string& path) {
-  std::ifstream file(path, std::ios::binary);
-  if (!file) Fail(path + " cannot be read");
-  std::ostringstream bytes;
-  bytes << file.rdbuf();
-  return bytes.str();
+/// From the start of the program to "listening on", with many models in the registry.
+std::vector<Row> Start(const std::string& data) {
+  {
+    ServerProcess server = ServerProcess::Metaekfd(data);
+    client::Client client({.server = server.address()});
+    for (int i = 0; i < kModels; ++i) Check(client.ImportModel("model-" + std::to_string(i), ZooModel(i)).status(), "importing");
+    server.End(SIGTERM);
+  }
+  std::vector<double> seconds;
+  for (int round = 0; round < kRounds; ++round) {
+    const steady_clock::time_point begin = steady_clock::now();
+    ServerProcess server = ServerProcess::Metaekfd(data);
+    seconds.push_back(SecondsSince(begin));
+    if (server.address().empty()) Fail("the server does not start");
+    server.End(SIGTERM);
+  }
+  return {{"start with " + std::to_string(kModels) + " models", "s", Median(seconds), kNaN, kNaN, ""}};
 }
 
-int Main(const std::string& json) {
+/// @param only  the one table to make; empty: all.
+int Main(const std::string& only, const std::string& json) {
   const std::filesystem::path data = std::filesystem::temp_directory_path() / ("metaekf-benchmark-" + std::to_string(getpid()));
+  std::filesystem::create_directories(data);
   std::vector<Row> all;
+  const auto report = [&](const std::string& title, const std::function<std::vector<Row>()>& measure) {
+    if (!only.empty() && only != title) return;
+    const std::vector<Row> rows = measure();
+    Print(title, rows);
+    all.insert(all.end(), rows.begin(), rows.end());
+  };
   {
-    const Server ours(METAEKFD_BINARY, {"--data-dir", data.string(), "--listen", "127.0.0.1:0"}), echo(METAEKF_ECHO_BINARY, {});
+    ServerProcess ours = ServerProcess::Metaekfd((data / "streams").string()), echo(METAEKF_ECHO_BINARY, {});
+    if (ours.address().empty() || echo.address().empty()) Fail("a server does not start");
     client::Client client({.server = ours.address()});
-    Check(client.ImportModel("van-der-pol", Contents(METAEKF_SOURCE_DIR "/deploy/zoo/van-der-pol.safetensors")).status(), "importing");
-    for (const auto& [title, measure] : {std::pair{"Streams", &Throughput}, {"Latency", &Latency}}) {
-      const std::vector<Row> rows = measure(&client, echo.address());
-      Print(title, rows);
-      all.insert(all.end(), rows.begin(), rows.end());
-    }
+    Check(client.ImportModel("van-der-pol", ZooModel()).status(), "importing");
+    report("Streams", [&] { return Throughput(&client, echo.address()); });
+    report("Latency", [&] { return Latency(&client, echo.address()); });
+    ours.End(SIGTERM);
+    echo.End(SIGTERM);
   }
+  report("Growth", [&] {
+    ServerProcess server = ServerProcess::Metaekfd((data / "growth").string());
+    client::Client client({.server = server.address()});
+    Check(client.ImportModel("van-der-pol", ZooModel()).status(), "importing");
+    std::vector<Row> rows = Growth(server);
+    server.End(SIGTERM);
+    return rows;
+  });
+  report("Start", [&] { return Start((data / "start").string()); });
   std::filesystem::remove_all(data);
+  if (all.empty()) Fail("there is no table " + only + "; there are Streams, Latency, Growth and Start");
   if (!json.empty() && !AddToJson(json, all)) Fail(json + " cannot be written");
   return 0;
 }
@@ -273,10 +281,13 @@ int Main(const std::string& json) {
 }  // namespace metaekf::benchmark
 
 int main(int argc, char** argv) {
-  const bool with_json = argc == 3 && std::string(argv[1]) == "--json";
-  if (argc != 1 && !with_json) {
-    std::fprintf(stderr, "usage: %s [--json FILE]\n", argv[0]);
+  std::map<std::string, std::string> options = {{"--only", ""}, {"--json", ""}};
+  for (int i = 1; i + 1 < argc; i += 2) {
+    if (const auto option = options.find(argv[i]); option != options.end()) option->second = argv[i + 1];
+  }
+  if (argc % 2 == 0 || argc > 5 || (argc > 1 && options["--only"].empty() && options["--json"].empty())) {
+    std::fprintf(stderr, "usage: %s [--only TABLE] [--json FILE]\n", argv[0]);
     return 2;
   }
-  return metaekf::benchmark::Main(with_json ? argv[2] : "");
+  return metaekf::benchmark::Main(options["--only"], options["--json"]);
 }

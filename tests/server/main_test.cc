@@ -26,7 +26,7 @@ TEST(MetaekfdTest, ExitStatusTellsWrongUsageFromFailure) {
 
 TEST(MetaekfdTest, ADirectoryIsServedByOne) {
   store::TempDirectory directory;
-  ServerProcess server(directory.path());
+  ServerProcess server = ServerProcess::Metaekfd(directory.path());
   EXPECT_NE(server.address(), "");
   EXPECT_EQ(ExitStatus({"--data-dir", directory.path(), "--listen", "127.0.0.1:0"}), 1);
   EXPECT_EQ(server.End(SIGTERM).code, 0);

@@ -25,7 +25,7 @@ class KillTest : public testing::Test {
  protected:
   /// Starts a server, repeats `piece` against it, and kills it after so many changes; returns how many pieces were confirmed.
   int KillAfter(size_t changes, const std::function<bool(Client&)>& piece) {
-    ServerProcess server(directory_.path(), config_);
+    ServerProcess server = ServerProcess::Metaekfd(directory_.path(), config_);
     EXPECT_NE(server.address(), "") << "the server did not start";
     if (HasFailure()) return 0;
     Client client(server.address());
@@ -42,7 +42,7 @@ class KillTest : public testing::Test {
 
   /// Runs `work` against a server that then ends in peace.
   void WithServer(const std::function<void(Client&)>& work) {
-    ServerProcess server(directory_.path(), config_);
+    ServerProcess server = ServerProcess::Metaekfd(directory_.path(), config_);
     ASSERT_NE(server.address(), "") << "the server did not start";
     {
       Client client(server.address());  // gone before the end: a connection that nobody polls makes the server wait
@@ -102,7 +102,7 @@ TEST_F(KillTest, TrainingGoesOnAfterEachOfTwentyKills) {
   base::Rng rng(2025);
   for (int round = 0; round < kRounds && !HasFailure(); ++round) {
     SCOPED_TRACE(round);
-    ServerProcess server(directory_.path(), config_);
+    ServerProcess server = ServerProcess::Metaekfd(directory_.path(), config_);
     ASSERT_NE(server.address(), "") << "the server did not start";
     Client client(server.address());
     CheckEverything(client);
@@ -110,7 +110,7 @@ TEST_F(KillTest, TrainingGoesOnAfterEachOfTwentyKills) {
     EXPECT_EQ(server.End(SIGKILL).signal, SIGKILL);
   }
   // It is still the first job, further on than any server left it in the meantime.
-  ServerProcess server(directory_.path(), config_);
+  ServerProcess server = ServerProcess::Metaekfd(directory_.path(), config_);
   Client client(server.address());
   const auto jobs = client.Call(v1::ListJobsRequest());
   ASSERT_THAT(jobs.value.jobs(), SizeIs(1));

@@ -5,23 +5,32 @@
 
 #include <optional>
 #include <string>
+#include <vector>
 
 #include "server/training/worker_process.h"
 
 namespace metaekf::server {
 
-/// A metaekfd of its own process on a port that it picks, to be killed.
+/// A server of its own process that prints "listening on HOST:PORT"; killed with this object.
 class ServerProcess {
  public:
   /// Returns once it listens, or with an empty address() if it ended before.
-  explicit ServerProcess(const std::string& data_directory, const std::string& config = "")
-      : process_(Start(data_directory, config)) {
+  ServerProcess(const std::string& binary, const std::vector<std::string>& arguments)
+      : process_(WorkerProcess::Start(binary, arguments).value()) {
     const std::string prefix = "listening on ";
     const auto line = process_.ReadLine(absl::Seconds(30), /*wake_fd=*/-1);
     if (line && line->rfind(prefix, 0) == 0) address_ = line->substr(prefix.size());
   }
 
+  /// A metaekfd on a port that it picks.
+  static ServerProcess Metaekfd(const std::string& data_directory, const std::string& config = "") {
+    std::vector<std::string> arguments = {"--data-dir", data_directory, "--listen", "127.0.0.1:0"};
+    if (!config.empty()) arguments.insert(arguments.end(), {"--config", config});
+    return ServerProcess(METAEKFD_BINARY, arguments);
+  }
+
   const std::string& address() const { return address_; }
+  pid_t pid() const { return process_.pid(); }
 
   WorkerProcess::Exit End(int signal) {
     process_.Signal(signal);
@@ -29,12 +38,6 @@ class ServerProcess {
   }
 
  private:
-  static WorkerProcess Start(const std::string& data_directory, const std::string& config) {
-    std::vector<std::string> arguments = {"--data-dir", data_directory, "--listen", "127.0.0.1:0"};
-    if (!config.empty()) arguments.insert(arguments.end(), {"--config", config});
-    return WorkerProcess::Start(METAEKFD_BINARY, arguments).value();
-  }
-
   WorkerProcess process_;
   std::string address_;
 };
