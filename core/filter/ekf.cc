@@ -154,6 +154,7 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
   ekf.state_.mean = ekf.initial_mean_;
   ekf.state_.factor = ekf.initial_factor_;
   ekf.state_.last_input = VectorXd::Zero(ekf.input_size_);
+  ekf.state_.nis = NisMonitor(n_y);
   ekf.state_.window.reserve(ekf.window_size_);
   ekf.u_.resize(ekf.input_size_);
   ekf.y_.resize(n_y);
@@ -235,7 +236,7 @@ void Ekf::Restart() {
   state_.mean = initial_mean_;
   state_.factor = initial_factor_;
   state_.window.clear();
-  state_.nis = {};
+  state_.nis = NisMonitor(output_size_);
   state_.gated_in_row = 0;
   state_.started = state_.diverged = false;
 }
@@ -316,7 +317,7 @@ void Ekf::MeasurementUpdate(const MatrixXd& R, FilterModel::Scratch* scratch, Es
   const bool outliers = !gate_limits_.empty() && !(estimate->nis <= gate_limits_[m - 1] * std::max(1.0, state_.nis.Ratio()));
   if (!outliers || !state_.mean.allFinite()) {
     state_.gated_in_row = 0;
-    state_.nis.Add(estimate->nis, estimate->measured);
+    state_.nis.Add(estimate->nis, estimate->measured, whitened_.head(updated_ == output_size_ ? updated_ : 0));
     return MoveMean();
   }
   state_.factor = prior_factor_;

@@ -1,6 +1,8 @@
 #include "core/filter/health.h"
 
 #include <algorithm>
+#include <cmath>
+#include <limits>
 
 #include "core/filter/chi_squared.h"
 
@@ -10,23 +12,41 @@ namespace {
 constexpr int64_t kMemory = 100;             // samples
 constexpr double kLowest = 0.82, kHighest = 1.17;  // (1.96/2.17)² and (1.96/1.81)²
 constexpr double kTail = 0.0005;             // of the χ² test, on each side
+constexpr double kWhitest = 3.29;            // of a standard normal number: the same share is beyond
+constexpr int64_t kLeastPairs = 20;
+
+/// Samples that a mean over the last kMemory is worth: one with weights w (1 − w)^k has the variance of one over 2/w − 1 samples; a
+/// plain mean that of one over all.
+double Effective(int64_t samples) { return samples < kMemory ? static_cast<double>(samples) : 2.0 * kMemory - 1; }
 
 }  // namespace
 
-void NisMonitor::Add(double sample_nis, int sample_measured) {
+NisMonitor::NisMonitor(Eigen::Index outputs) : last(Eigen::VectorXd::Constant(outputs, std::numeric_limits<double>::quiet_NaN())) {}
+
+void NisMonitor::Add(double sample_nis, int sample_measured, const Eigen::Ref<const Eigen::VectorXd>& whitened) {
   samples = std::min(samples + 1, kMemory);
   const double weight = 1 / static_cast<double>(samples);
   nis += weight * (sample_nis - nis);
   measured += weight * (sample_measured - measured);
+  if (whitened.size() == 0) return;
+  if (last.size() == whitened.size() && !last.hasNaN()) {
+    pairs = std::min(pairs + 1, kMemory);
+    correlation += (whitened.dot(last) - correlation) / static_cast<double>(pairs);
+  }
+  last = whitened;
+}
+
+bool NisMonitor::Correlated() const {
+  if (pairs < kLeastPairs || !(nis > 0)) return false;
+  return correlation / nis * std::sqrt(Effective(pairs) * static_cast<double>(last.size())) > kWhitest;
 }
 
 Health NisMonitor::Judge() const {
   if (samples == 0) return Health::kConsistent;
+  if (Correlated()) return Health::kOverconfident;
   const double ratio = Ratio();
   if (ratio >= kLowest && ratio <= kHighest) return Health::kConsistent;
-  // A mean with weights w (1 − w)^k has the variance of one over 2/w − 1 samples; a plain mean that of one over all.
-  const double effective = samples < kMemory ? static_cast<double>(samples) : 2.0 * kMemory - 1;
-  const double dof = std::max(1.0, effective * measured);
+  const double dof = std::max(1.0, Effective(samples) * measured);
   const double beyond = ChiSquaredTail(ratio * dof, dof);
   if (ratio > kHighest && beyond < kTail) return Health::kOverconfident;
   if (ratio < kLowest && 1 - beyond < kTail) return Health::kUnderconfident;

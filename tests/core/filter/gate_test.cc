@@ -54,6 +54,38 @@ TEST(NisMonitorTest, SaysWhichWayTheCovarianceIsWrong) {
   EXPECT_EQ(NisMonitor().Judge(), Health::kConsistent);
 }
 
+TEST(NisMonitorTest, SaysWhetherInnovationsGoOnAsTheLast) {
+  base::Rng rng(5);
+  // w = ρ w of the last sample + √(1 − ρ²) white: as large as the covariance says where `scale` is 1.
+  const auto judge = [&](double rho, double scale) {
+    NisMonitor monitor;
+    VectorXd w = VectorXd::Zero(2);
+    for (int t = 0; t < 1000; ++t) {
+      for (double& component : w) component = rho * component + std::sqrt(1 - rho * rho) * rng.Normal();
+      monitor.Add(scale * scale * w.squaredNorm(), 2, scale * w);
+    }
+    return monitor.Judge();
+  };
+  for (int run = 0; run < 20; ++run) {
+    EXPECT_EQ(judge(0, 1), Health::kConsistent);
+    EXPECT_EQ(judge(0.6, 1), Health::kOverconfident);
+    EXPECT_EQ(judge(0.6, 0.5), Health::kOverconfident) << "the error lasts, however wide the bounds";
+    EXPECT_EQ(judge(0, 0.5), Health::kUnderconfident);
+    EXPECT_EQ(judge(-0.6, 1), Health::kConsistent) << "corrected too much, but no error lasts";
+  }
+}
+
+TEST(NisMonitorTest, SamplesThatAreNotMeasuredAsAWholeLeaveTheCorrelationAsItIs) {
+  NisMonitor monitor;
+  const VectorXd w{{1, 1}};
+  for (int t = 0; t < 30; ++t) monitor.Add(2, 2, w);
+  EXPECT_TRUE(monitor.Correlated());
+  const double before = monitor.correlation;
+  monitor.Add(1, 1);
+  EXPECT_EQ(monitor.correlation, before);
+  EXPECT_EQ(monitor.pairs, 29);
+}
+
 TEST(NisMonitorTest, ForgetsWhatIsLongAgo) {
   NisMonitor monitor;
   for (int t = 0; t < 100; ++t) monitor.Add(9, 1);
