@@ -38,25 +38,28 @@ data::Trajectory Simulated(const std::string& system, int64_t steps, const std::
       .dataset.trajectories[0];
 }
 
-void Steps(const nssm::Bundle& bundle, int count) {
+/// @param outputs  a column per step.
+void Steps(const nssm::Bundle& bundle, const Eigen::MatrixXd& outputs) {
   const std::shared_ptr<const filter::FilterModel> model = filter::FilterModel::Create(bundle);
   filter::Ekf ekf = filter::Ekf::Create(bundle, model, model->Prepare(bundle), {}).value();
   const auto scratch = model->MakeScratch();
   filter::Estimate estimate = ekf.MakeEstimate();
-  const Eigen::VectorXd u = Eigen::VectorXd::Constant(ekf.input_size(), 0.3), y = Eigen::VectorXd::Constant(ekf.output_size(), 0.1);
-  const auto step = [&] { (void)ekf.Step(u, y, scratch.get(), &estimate); };
-  step();  // the first has no time update
+  const Eigen::VectorXd u = Eigen::VectorXd::Constant(ekf.input_size(), 0.3);
+  const auto step = [&](Eigen::Index t) { (void)ekf.Step(u, outputs.col(t), scratch.get(), &estimate); };
+  step(0);  // the first has no time update
   MeasuredHotPath([&] {
-    for (int i = 0; i < count; ++i) step();
+    for (Eigen::Index t = 1; t < outputs.cols(); ++t) step(t);
   });
 }
 
-void SmallStep() { Steps(ZooModel("van-der-pol"), 200); }
+Eigen::MatrixXd Oscillation(int64_t steps) { return Simulated("van-der-pol", steps, {{"noise_std", "0.005"}}).outputs; }
+
+void SmallStep() { Steps(ZooModel("van-der-pol"), Oscillation(201)); }
 
 void LargeStep() {
   nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(benchmark::LocalisationSpec()));
   bundle.parameters = bundle.model.InitialParameters(1);
-  Steps(bundle, 4);
+  Steps(bundle, Eigen::MatrixXd::Constant(2, 5, 0.1));
 }
 
 void RolloutGradient() {
@@ -95,11 +98,13 @@ void EstimateBatch() {
   v1::OpenSession open;
   open.set_covariance_format(v1::OpenSession::DIAGONAL);
   const auto session = server::Session::Open(model, open).value();
+  const Eigen::MatrixXd outputs = Oscillation(2 * kBatch);
   uint64_t next = 1;
   const auto apply = [&] {
     v1::EstimateRequest request;
     request.mutable_samples()->set_first_seq(next);
-    for (int i = 0; i < 2 * kBatch; ++i) request.mutable_samples()->add_outputs(0.1);
+    const double* const from = outputs.col(static_cast<Eigen::Index>(next) - 1).data();
+    request.mutable_samples()->mutable_outputs()->Add(from, from + outputs.rows() * kBatch);
     const std::string bytes = request.SerializeAsString();
     v1::EstimateRequest received;
     v1::EstimateResponse response;
