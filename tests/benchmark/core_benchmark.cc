@@ -92,18 +92,8 @@ MetaSeconds LocalisationLearning() {
 }
 
 double SmallRolloutSeconds() {
-  const nssm::ModelSpec spec = benchmark::SmallSpec();
-  const nssm::Model model = *nssm::Model::Create(spec);
-  const nssm::LossSpec loss{.horizon = nssm::LossSpec::kWholeSet, .state_weight = 0, .reconstruction_weight = 0};
-  const nssm::LossShape shape = *nssm::ShapeOfLoss(spec, loss, 4097);
-  const auto data = nssm::CutLossData<float>(spec, loss, nssm::RandomTrajectory(spec, 4097, 1), 0, shape);
-  const nn::Mask mask = *nn::ParseMask("transition,output_decoder", model.layout());
-  const nssm::LossFunction<float> function(model, loss, shape, mask, mask);
-  auto scratch = function.MakeScratch();
-  const std::vector<double> initial = model.InitialParameters(1);
-  const std::vector<float> parameters(initial.begin(), initial.end());
-  std::vector<float> gradient(parameters.size());
-  return MedianSeconds(51, [&] { function.Gradient(parameters.data(), data, gradient.data(), &scratch); });
+  benchmark::SmallRollout rollout(4096);
+  return MedianSeconds(51, [&] { rollout.ComputeGradient(); });
 }
 
 double PeakRssMib() {

@@ -15,7 +15,6 @@
 #include "core/sim/simulate.h"
 #include "server/session/session.h"
 #include "tests/benchmark/networks.h"
-#include "tests/core/nssm/random_models.h"
 #include "tests/support/bundles.h"
 
 /// What callgrind counts: it collects inside the function of this name only.
@@ -63,21 +62,9 @@ void LargeStep() {
 }
 
 void RolloutGradient() {
-  constexpr int64_t kSamples = 513;
-  const nssm::ModelSpec spec = benchmark::SmallSpec();
-  const nssm::Model model = *nssm::Model::Create(spec);
-  const nssm::LossSpec loss{.horizon = nssm::LossSpec::kWholeSet, .state_weight = 0, .reconstruction_weight = 0};
-  const nssm::LossShape shape = *nssm::ShapeOfLoss(spec, loss, kSamples);
-  const auto data = nssm::CutLossData<float>(spec, loss, nssm::RandomTrajectory(spec, kSamples, 1), 0, shape);
-  const nn::Mask mask = *nn::ParseMask("transition,output_decoder", model.layout());
-  const nssm::LossFunction<float> function(model, loss, shape, mask, mask);
-  auto scratch = function.MakeScratch();
-  const std::vector<double> initial = model.InitialParameters(1);
-  const std::vector<float> parameters(initial.begin(), initial.end());
-  std::vector<float> gradient(parameters.size());
-  const auto compute = [&] { function.Gradient(parameters.data(), data, gradient.data(), &scratch); };
-  compute();
-  MeasuredHotPath(compute);
+  benchmark::SmallRollout rollout(512);
+  rollout.ComputeGradient();
+  MeasuredHotPath([&] { rollout.ComputeGradient(); });
 }
 
 /// Exact second-order fits under the learned prior.

@@ -3,7 +3,8 @@
 #include <utility>
 #include <vector>
 
-#include "core/nssm/model.h"
+#include "core/nssm/loss.h"
+#include "tests/core/nssm/random_models.h"
 
 namespace metaekf::benchmark {
 
@@ -30,5 +31,33 @@ inline nssm::ModelSpec SmallSpec() {
   spec.output_decoder.bias = false;
   return spec;
 }
+
+/// The small network's free run over so many steps, and its gradient.
+class SmallRollout {
+ public:
+  explicit SmallRollout(int64_t steps)
+      : model_(*nssm::Model::Create(SmallSpec())),
+        shape_(*nssm::ShapeOfLoss(model_.spec(), kLoss, steps + 1)),
+        data_(nssm::CutLossData<float>(model_.spec(), kLoss, nssm::RandomTrajectory(model_.spec(), steps + 1, 1), 0, shape_)),
+        mask_(*nn::ParseMask("transition,output_decoder", model_.layout())),
+        function_(model_, kLoss, shape_, mask_, mask_),
+        scratch_(function_.MakeScratch()),
+        gradient_(static_cast<size_t>(model_.layout().size())) {
+    const std::vector<double> initial = model_.InitialParameters(1);
+    parameters_.assign(initial.begin(), initial.end());
+  }
+
+  void ComputeGradient() { function_.Gradient(parameters_.data(), data_, gradient_.data(), &scratch_); }
+
+ private:
+  inline static const nssm::LossSpec kLoss{.horizon = nssm::LossSpec::kWholeSet, .state_weight = 0, .reconstruction_weight = 0};
+  nssm::Model model_;
+  nssm::LossShape shape_;
+  nssm::LossData<float> data_;
+  nn::Mask mask_;
+  nssm::LossFunction<float> function_;
+  nssm::LossFunction<float>::Scratch scratch_;
+  std::vector<float> parameters_, gradient_;
+};
 
 }  // namespace metaekf::benchmark
