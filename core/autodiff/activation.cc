@@ -9,6 +9,7 @@ bool IsSmooth(Activation activation) {
     case Activation::kMish:
     case Activation::kSoftplus:
     case Activation::kSine:
+    case Activation::kTanhSlope:
       return true;
     default:
       return false;
@@ -18,7 +19,7 @@ bool IsSmooth(Activation activation) {
 bool DerivativeIsZero(Activation activation, int order) {
   const bool piecewise_linear = activation == Activation::kIdentity || activation == Activation::kRelu ||
                                 activation == Activation::kLeakyRelu;
-  return piecewise_linear && order >= 2;
+  return (piecewise_linear && order >= 2) || (activation == Activation::kTanhSlope && order >= 3);
 }
 
 double DefaultParameter(Activation activation) {

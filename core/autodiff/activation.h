@@ -17,6 +17,7 @@ enum class Activation : uint8_t {
   kMish,      // z tanh(log(1 + eᶻ))
   kSoftplus,  // log(1 + eᶻ)
   kSine,      // sin z, |z| below 10⁴
+  kTanhSlope,  // 1 − z²: the slope of tanh where its value is z
 };
 
 /// The highest derivative that Apply knows: a curl-free output takes one derivative, its loss's
@@ -37,7 +38,7 @@ bool DerivativeIsZero(Activation activation, int order);
 double DefaultParameter(Activation activation);
 
 /// out_i = σ^(order)(z_i), i < count; in place is allowed. At the kink of a piecewise function the
-/// derivative is the right one. order must be 0 … kMaxDerivative. Vectorised for the processor at hand.
+/// derivative is the right one; σ of what is no number is none. order must be 0 … kMaxDerivative. Vectorised for the processor at hand.
 template <typename T>
 void ApplyActivation(Activation activation, int order, T a, const T* z, T* out, size_t count);
 

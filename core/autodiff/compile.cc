@@ -3,10 +3,10 @@
 #include <map>
 
 #include "core/autodiff/arena_allocator.h"
+#include "core/autodiff/kernel.h"
 #include "core/autodiff/merge_products.h"
 #include "core/autodiff/program.h"
 #include "core/autodiff/uses.h"
-#include "core/linalg/products.h"
 
 namespace metaekf::autodiff {
 namespace {
@@ -463,7 +463,7 @@ class Compiler {
       EmitCopy(&loop.instructions, written, at[static_cast<size_t>(out)], body.node(out));
     }
     for (Instruction& i : loop.instructions) {
-      if (WantsPanel(i, loop)) i.panel = Allocate(scratch, linalg::PanelSize(i.rows, i.inner));
+      if (WantsPanel(i, loop)) i.panel = Allocate(scratch, PanelSize(i.rows, i.inner));
     }
     program_.instructions.push_back(
         {.op = Opcode::kLoop, .loop = static_cast<int32_t>(program_.loops.size())});
@@ -476,7 +476,7 @@ class Compiler {
     constexpr int32_t kMostColumns = 8, kMostElements = 4096;
     if (i.op != Opcode::kMatMul && i.op != Opcode::kMatMulAdd) return false;
     if (i.transpose_b || i.cols > kMostColumns || i.rows * i.inner > kMostElements) return false;
-    if (i.a.step_stride != 0 || i.a.tile_width != 0 || i.b.tile_width != 0) return false;
+    if (i.a.step_stride != 0 || i.a.tile_width != 0 || i.b.tile_width != 0 || i.c.tile_width != 0) return false;
     return std::none_of(loop.instructions.begin(), loop.instructions.end(), [&](const Instruction& other) {
       return other.out.slot == i.a.slot && i.a.offset >= other.out.offset &&
              i.a.offset < other.out.offset + int64_t{other.out.ld} * other.cols;

@@ -32,6 +32,15 @@ std::vector<bool> AncestorsOf(const Graph& graph, const std::vector<Value>& outp
   return ancestor;
 }
 
+/// σ^(n+1)(z) beside σ^(n)(z). That of tanh comes from its value, which is there already.
+Value SlopeOf(Graph* graph, const Node& activation) {
+  const Value z = activation.inputs[0];
+  if (activation.activation == Activation::kTanh && activation.order == 0) {
+    return graph->Apply(Activation::kTanhSlope, 0, 0, graph->Apply(Activation::kTanh, activation.scalar, 0, z));
+  }
+  return graph->Apply(activation.activation, activation.scalar, activation.order + 1, z);
+}
+
 /// Of s = softmax(a), whose Jacobian is symmetric: (diag(s) − s sᵀ) v, column by column.
 Value SoftmaxDerivative(Graph* graph, Value s, Value v) {
   const int32_t rows = graph->node(s).rows;
@@ -184,10 +193,8 @@ class ForwardMode {
         assert(directions_ == 1);
         return graph_.AddOrEither(t(0) == kNoValue ? kNoValue : graph_.Dot(t(0), node.inputs[1]),
                                   t(1) == kNoValue ? kNoValue : graph_.Dot(node.inputs[0], t(1)));
-      case Op::kActivation: {
-        const Value slope = graph_.Apply(node.activation, node.scalar, node.order + 1, node.inputs[0]);
-        return graph_.Mul(Repeat(slope), t(0));
-      }
+      case Op::kActivation:
+        return graph_.Mul(Repeat(SlopeOf(&graph_, node)), t(0));
       case Op::kSoftmax:
         return SoftmaxDerivative(&graph_, Repeat(v), t(0));
       case Op::kTile:
@@ -353,11 +360,9 @@ class ReverseMode {
         if (IsActive(in(0))) Accumulate(in(0), graph_.ScaleBy(g, in(1)));
         if (IsActive(in(1))) Accumulate(in(1), graph_.ScaleBy(g, in(0)));
         return;
-      case Op::kActivation: {
-        const Value slope = graph_.Apply(node.activation, node.scalar, node.order + 1, in(0));
-        Accumulate(in(0), graph_.Mul(slope, g));
+      case Op::kActivation:
+        Accumulate(in(0), graph_.Mul(SlopeOf(&graph_, node), g));
         return;
-      }
       case Op::kSoftmax:
         Accumulate(in(0), SoftmaxDerivative(&graph_, graph_.Softmax(in(0)), g));
         return;

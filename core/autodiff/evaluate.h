@@ -23,17 +23,40 @@ class AlignedBuffer {
   std::unique_ptr<T[], Free> memory_;
 };
 
-/// A program with its constants in place: what runs. Never changes, so threads may share it.
+/// Where an instruction finds its operands, in a loop at the step at hand.
+template <typename T>
+struct Places {
+  T* out;
+  const T *a, *b, *c;
+  T* panel;
+};
+
+/// An instruction's way through a loop: where it is, and how many elements on each operand's next step lies.
+template <typename T>
+struct Walk {
+  Places<T> at;
+  int64_t out, a, b, c;
+};
+
+/// Runs an instruction.
+template <typename T>
+using Kernel = void (*)(const Instruction& i, const Places<T>& at);
+
+/// A program with its constants in place and a kernel for each instruction: what runs. Never changes, so threads may share it.
 template <typename T>
 class Executable {
  public:
   explicit Executable(Program program);
 
   const Program& program() const { return program_; }
+  const std::vector<Kernel<T>>& kernels() const { return kernels_; }
+  const std::vector<std::vector<Kernel<T>>>& loop_kernels() const { return loop_kernels_; }
   const T* constants() const { return constants_.data(); }
 
  private:
   Program program_;
+  std::vector<Kernel<T>> kernels_;
+  std::vector<std::vector<Kernel<T>>> loop_kernels_;
   AlignedBuffer<T> constants_;
 };
 
@@ -43,9 +66,12 @@ class Arena {
  public:
   explicit Arena(const std::vector<const Executable<T>*>& users);
   T* data() const { return memory_.data(); }
+  /// One for each instruction of a loop.
+  Walk<T>* walks() const { return walks_.data(); }
 
  private:
   AlignedBuffer<T> memory_;
+  mutable std::vector<Walk<T>> walks_;
 };
 
 /// Which memory each slot is. Inputs are only read.

@@ -13,14 +13,6 @@
 #include <cstring>
 #include <type_traits>
 
-#ifndef METAEKF_PANEL_HEIGHT  // once, not for each instruction set
-#define METAEKF_PANEL_HEIGHT
-namespace metaekf::linalg {
-/// Rows of a panel for m rows of a factor: whole vectors of any instruction set.
-constexpr ptrdiff_t PanelHeight(int32_t m) { return (ptrdiff_t{m} + 15) / 16 * 16; }
-}  // namespace metaekf::linalg
-#endif
-
 // Sums stay in registers only where the loops over them are unrolled.
 #undef METAEKF_UNROLL
 #ifdef __clang__
@@ -107,14 +99,24 @@ HWY_INLINE void Tile(D d, int rows, int k, const T* HWY_RESTRICT a, ptrdiff_t ld
   }
 }
 
-/// One row of tiles, `columns` wide.
-template <int kVectors, int kColumns, class D, typename T = hn::TFromD<D>>
-HWY_INLINE void Strip(D d, int rows, int columns, int k, const T* a, ptrdiff_t lda, Strided<T> b, Target<T> c) {
-  for (; columns >= kColumns; columns -= kColumns, b.at += kColumns * b.by_column, c.at += kColumns * c.ld) {
-    Tile<kVectors, kColumns>(d, rows, k, a, lda, b, c);
+/// A tile of `columns` ≤ kMost columns.
+template <int kVectors, int kMost = kTileColumns, class D, typename T = hn::TFromD<D>>
+HWY_INLINE void TileOf(D d, int rows, int columns, int k, const T* a, ptrdiff_t lda, Strided<T> b, Target<T> c) {
+  if constexpr (kMost > 1) {
+    if (columns < kMost) return TileOf<kVectors, kMost - 1>(d, rows, columns, k, a, lda, b, c);
   }
-  if constexpr (kColumns > 1) {
-    if (columns > 0) Strip<kVectors, (kColumns + 1) / 2>(d, rows, columns, k, a, lda, b, c);
+  Tile<kVectors, kMost>(d, rows, k, a, lda, b, c);
+}
+
+/// One row of tiles, `columns` wide. They are few and of nearly the same width: in a narrow one sums wait for themselves.
+template <int kVectors, class D, typename T = hn::TFromD<D>>
+HWY_INLINE void Strip(D d, int rows, int columns, int k, const T* a, ptrdiff_t lda, Strided<T> b, Target<T> c) {
+  for (int tiles = (columns + kTileColumns - 1) / kTileColumns; tiles > 0; --tiles) {
+    const int width = (columns + tiles - 1) / tiles;
+    TileOf<kVectors>(d, rows, width, k, a, lda, b, c);
+    columns -= width;
+    b.at += width * b.by_column;
+    c.at += width * c.ld;
   }
 }
 
@@ -166,11 +168,9 @@ void Panels(D d, int m, int n, int k, Strided<T> a, Strided<T> b, Target<T> c) {
       const int full = kVectors * static_cast<int>(hn::Lanes(tag));
       const Strided<T> from{a.at + row * a.by_row + depth * a.by_column, a.by_row, a.by_column};
       const Target<T> to{c.at + row, c.ld, c.accumulate};
-      if (a.by_row == 1 && rows == full && n < kCopyFromTiles * kTileColumns) {
-        return Strip<kVectors, kTileColumns>(tag, rows, n, part, from.at, a.by_column, b_part, to);
-      }
-      CopyPanel(tag, rows, full, part, from, panel);
-      Strip<kVectors, kTileColumns>(tag, rows, n, part, panel, full, b_part, to);
+      const bool copy = a.by_row != 1 || rows != full || n >= kCopyFromTiles * kTileColumns;
+      if (copy) CopyPanel(tag, rows, full, part, from, panel);
+      Strip<kVectors>(tag, rows, n, part, copy ? panel : from.at, copy ? full : a.by_column, b_part, to);
     };
     int row = 0;
     for (; row + height <= m; row += height) strip(d, std::integral_constant<int, kTileVectors>(), row, height);
@@ -292,6 +292,24 @@ void AsTranspose(D d, int m, int n, int k, const T* a, ptrdiff_t lda, const T* b
   }
 }
 
+/// C = A Bᵀ of few rows and columns and many samples: stretches of samples are turned round, so that scalar products run along them.
+template <class D, typename T = hn::TFromD<D>>
+void AsDots(D d, int m, int n, int k, const T* a, ptrdiff_t lda, const T* b, ptrdiff_t ldb, Target<T> c) {
+  constexpr int kStretch = 64, kMost = 16;  // rows: fewer than a vector has lanes
+  HWY_ALIGN T rows_of_a[kMost * kStretch], rows_of_b[kMost * kStretch];
+  const auto turn = [&](const T* from, ptrdiff_t ld, int rows, int columns, T* to) {
+    for (int l = 0; l < columns; ++l) {
+      for (int i = 0; i < rows; ++i) to[i * kStretch + l] = from[i + l * ld];
+    }
+  };
+  for (int l = 0; l < k; l += kStretch, c.accumulate = true) {
+    const int columns = std::min(kStretch, k - l);
+    turn(a + l * lda, lda, m, columns, rows_of_a);
+    turn(b + l * ldb, ldb, n, columns, rows_of_b);
+    Dots(d, m, n, columns, rows_of_a, kStretch, rows_of_b, kStretch, c);
+  }
+}
+
 template <typename T>
 void Product(bool transpose_a, bool transpose_b, int m, int n, int k, const T* a, int lda, const T* b, int ldb, T* c, int ldc,
              bool accumulate) {
@@ -301,6 +319,7 @@ void Product(bool transpose_a, bool transpose_b, int m, int n, int k, const T* a
   if (transpose_a && !transpose_b && (n <= kDotMaxColumns || 2 * m < lanes) && k >= kDotMinDepthVectors * lanes) {
     return Dots(d, m, n, k, a, lda, b, ldb, to);
   }
+  if (!transpose_a && transpose_b && m < lanes && n < lanes && k >= kDotMinDepthVectors * lanes) return AsDots(d, m, n, k, a, lda, b, ldb, to);
   if (!transpose_a && transpose_b && m < lanes && n >= lanes) return AsTranspose(d, m, n, k, a, lda, b, ldb, to);
   const Strided<T> by_a = transpose_a ? Strided<T>{a, lda, 1} : Strided<T>{a, 1, lda};
   const Strided<T> by_b = transpose_b ? Strided<T>{b, ldb, 1} : Strided<T>{b, 1, ldb};
@@ -316,67 +335,6 @@ void DoubleProduct(bool transpose_a, bool transpose_b, int m, int n, int k, cons
   Product(transpose_a, transpose_b, m, n, k, a, lda, b, ldb, c, ldc, accumulate);
 }
 
-/// kVectors vectors of one column of C. What each element is does not depend on kVectors.
-template <int kVectors, class D, typename T = hn::TFromD<D>>
-HWY_INLINE void PanelColumn(D d, int rows, int k, const T* HWY_RESTRICT panel, ptrdiff_t height, const T* HWY_RESTRICT b,
-                            const T* addend, T* c) {
-  const int lanes = static_cast<int>(hn::Lanes(d));
-  // Two sums of each: a single one would wait for itself.
-  hn::Vec<D> sums[2][kVectors];
-  METAEKF_UNROLL
-  for (int i = 0; i < kVectors; ++i) sums[0][i] = sums[1][i] = hn::Zero(d);
-  int l = 0;
-  for (; l + 2 <= k; l += 2, panel += 2 * height) {
-    const auto even = hn::Set(d, b[l]), odd = hn::Set(d, b[l + 1]);
-    METAEKF_UNROLL
-    for (int i = 0; i < kVectors; ++i) {
-      sums[0][i] = hn::MulAdd(hn::Load(d, panel + i * lanes), even, sums[0][i]);
-      sums[1][i] = hn::MulAdd(hn::Load(d, panel + height + i * lanes), odd, sums[1][i]);
-    }
-  }
-  if (l < k) {
-    METAEKF_UNROLL
-    for (int i = 0; i < kVectors; ++i) sums[0][i] = hn::MulAdd(hn::Load(d, panel + i * lanes), hn::Set(d, b[l]), sums[0][i]);
-  }
-  METAEKF_UNROLL
-  for (int i = 0; i < kVectors; ++i, rows -= lanes, c += lanes) {
-    const auto sum = hn::Add(sums[0][i], sums[1][i]);
-    if (rows >= lanes) {
-      hn::StoreU(addend == nullptr ? sum : hn::Add(hn::LoadU(d, addend), sum), d, c);
-    } else {
-      HWY_ALIGN T buffer[hn::MaxLanes(D())];
-      hn::Store(sum, d, buffer);
-      for (int r = 0; r < rows; ++r) c[r] = addend == nullptr ? buffer[r] : addend[r] + buffer[r];
-    }
-    if (addend != nullptr) addend += lanes;
-  }
-}
-
-template <typename T>
-HWY_INLINE void ProductOfPanel(int m, int n, int k, const T* panel, const T* b, ptrdiff_t ldb, const T* addend, ptrdiff_t ldd, T* c, ptrdiff_t ldc) {
-  const hn::ScalableTag<T> d;
-  const hn::CappedTag<T, 4> narrow;
-  const int lanes = static_cast<int>(hn::Lanes(d));
-  const ptrdiff_t height = PanelHeight(m);
-  for (int j = 0; j < n; ++j, b += ldb, c += ldc) {
-    int row = 0;
-    for (; m - row > lanes; row += 2 * lanes) PanelColumn<2>(d, m - row, k, panel + row, height, b, addend ? addend + row : nullptr, c + row);
-    if (m - row > static_cast<int>(hn::Lanes(narrow))) {
-      PanelColumn<1>(d, m - row, k, panel + row, height, b, addend ? addend + row : nullptr, c + row);
-    } else if (row < m) {
-      PanelColumn<1>(narrow, m - row, k, panel + row, height, b, addend ? addend + row : nullptr, c + row);
-    }
-    if (addend != nullptr) addend += ldd;
-  }
-}
-
-void FloatPanelProduct(int m, int n, int k, const float* panel, const float* b, int ldb, const float* d, int ldd, float* c, int ldc) {
-  ProductOfPanel(m, n, k, panel, b, ldb, d, ldd, c, ldc);
-}
-void DoublePanelProduct(int m, int n, int k, const double* panel, const double* b, int ldb, const double* d, int ldd, double* c, int ldc) {
-  ProductOfPanel(m, n, k, panel, b, ldb, d, ldd, c, ldc);
-}
-
 }  // namespace HWY_NAMESPACE
 }  // namespace metaekf::linalg
 HWY_AFTER_NAMESPACE();
@@ -386,8 +344,6 @@ namespace metaekf::linalg {
 
 HWY_EXPORT(FloatProduct);
 HWY_EXPORT(DoubleProduct);
-HWY_EXPORT(FloatPanelProduct);
-HWY_EXPORT(DoublePanelProduct);
 
 namespace {
 
@@ -445,29 +401,6 @@ void MatMul(bool transpose_a, bool transpose_b, int32_t m, int32_t n, int32_t k,
 
 template void MatMul(bool, bool, int32_t, int32_t, int32_t, const float*, int32_t, const float*, int32_t, float*, int32_t, bool);
 template void MatMul(bool, bool, int32_t, int32_t, int32_t, const double*, int32_t, const double*, int32_t, double*, int32_t, bool);
-
-template <typename T>
-void MakePanel(bool transpose_a, int32_t m, int32_t k, const T* a, int32_t lda, T* panel) {
-  for (int32_t l = 0; l < k; ++l, panel += PanelHeight(m)) {
-    std::fill_n(panel, PanelHeight(m), T(0));
-    for (int32_t i = 0; i < m; ++i) panel[i] = transpose_a ? a[l + ptrdiff_t{i} * lda] : a[i + ptrdiff_t{l} * lda];
-  }
-}
-template void MakePanel(bool, int32_t, int32_t, const float*, int32_t, float*);
-template void MakePanel(bool, int32_t, int32_t, const double*, int32_t, double*);
-
-int64_t PanelSize(int32_t m, int32_t k) { return int64_t{PanelHeight(m)} * k; }
-
-template <typename T>
-void PanelProduct(int32_t m, int32_t n, int32_t k, const T* panel, const T* b, int32_t ldb, const T* d, int32_t ldd, T* c, int32_t ldc) {
-  if constexpr (sizeof(T) == sizeof(float)) {
-    HWY_DYNAMIC_DISPATCH(FloatPanelProduct)(m, n, k, panel, b, ldb, d, ldd, c, ldc);
-  } else {
-    HWY_DYNAMIC_DISPATCH(DoublePanelProduct)(m, n, k, panel, b, ldb, d, ldd, c, ldc);
-  }
-}
-template void PanelProduct(int32_t, int32_t, int32_t, const float*, const float*, int32_t, const float*, int32_t, float*, int32_t);
-template void PanelProduct(int32_t, int32_t, int32_t, const double*, const double*, int32_t, const double*, int32_t, double*, int32_t);
 
 void AddSquare(int32_t m, int32_t k, const double* a, int32_t lda, double* c, int32_t ldc) {
   constexpr int32_t kWidth = 48;

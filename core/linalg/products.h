@@ -14,16 +14,6 @@ template <typename T>
 void MatMul(bool transpose_a, bool transpose_b, int32_t m, int32_t n, int32_t k, const T* a, int32_t lda, const T* b, int32_t ldb, T* c,
             int32_t ldc, bool accumulate);
 
-/// A small factor that meets one vector after the other, as the weights of a recurrence do, laid out for that: op(A), m × k, column by
-/// column, each with zeros below it up to a whole vector. @param panel  PanelSize(m, k) elements.
-template <typename T>
-void MakePanel(bool transpose_a, int32_t m, int32_t k, const T* a, int32_t lda, T* panel);
-/// Elements of such a panel.
-int64_t PanelSize(int32_t m, int32_t k);
-/// C ← op(A) B, or C ← D + op(A) B, for A in a panel; B is k × n. @param d  m × n, may be C; null for none.
-template <typename T>
-void PanelProduct(int32_t m, int32_t n, int32_t k, const T* panel, const T* b, int32_t ldb, const T* d, int32_t ldd, T* c, int32_t ldc);
-
 /// The lower triangle of C += A Aᵀ; A is m × k. What stands above the diagonal of C afterwards means nothing.
 void AddSquare(int32_t m, int32_t k, const double* a, int32_t lda, double* c, int32_t ldc);
 

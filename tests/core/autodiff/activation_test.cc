@@ -12,7 +12,7 @@ namespace {
 
 constexpr Activation kAll[] = {Activation::kIdentity, Activation::kRelu,  Activation::kLeakyRelu,
                                Activation::kElu,      Activation::kSelu,  Activation::kTanh,
-                               Activation::kSwish,    Activation::kMish,  Activation::kSoftplus, Activation::kSine};
+                               Activation::kSwish,    Activation::kMish,  Activation::kSoftplus, Activation::kSine, Activation::kTanhSlope};
 
 double Value(Activation activation, int order, double z, double a) {
   double out;
@@ -82,6 +82,29 @@ TEST(ActivationTest, EachDerivativeIsTheSlopeOfTheOneBelow) {
             << "activation " << static_cast<int>(activation) << " order " << order << " z " << z;
       }
     }
+  }
+}
+
+// In float tanh is a quotient of polynomials of our own.
+TEST(ActivationTest, TanhInFloatIsTanhToItsRounding) {
+  for (float z = 1e-30f; z < 1e6f; z *= 1.0007f) {
+    for (const float signed_z : {z, -z}) {
+      float out;
+      ApplyActivation(Activation::kTanh, 0, 0.0f, &signed_z, &out, 1);
+      const double expected = std::tanh(static_cast<double>(signed_z));
+      ASSERT_NEAR(out, expected, 4e-7 * std::fabs(expected)) << signed_z;
+      ASSERT_LE(std::fabs(out), 1.0f) << signed_z;
+    }
+  }
+}
+
+TEST(ActivationTest, WhatIsNoNumberStaysNone) {
+  for (const Activation activation : kAll) {
+    const float none = std::nanf("");
+    float out;
+    ApplyActivation(activation, 0, 0.0f, &none, &out, 1);
+    EXPECT_TRUE(std::isnan(out)) << static_cast<int>(activation);
+    EXPECT_TRUE(std::isnan(Value(activation, 0, std::nan(""), 0))) << static_cast<int>(activation);
   }
 }
 

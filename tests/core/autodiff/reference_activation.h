@@ -99,6 +99,8 @@ T Apply(Activation activation, T a, T z) {
       return SoftplusDerivative<order>(z);
     case Activation::kSine:
       return order == 0 ? std::sin(z) : order == 1 ? std::cos(z) : order == 2 ? -std::sin(z) : -std::cos(z);
+    case Activation::kTanhSlope:
+      return order == 0 ? 1 - z * z : order == 1 ? -2 * z : order == 2 ? T(-2) : T(0);
     default:
       return order == 0 ? z : kConstant;
   }

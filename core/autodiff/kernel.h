@@ -1,0 +1,50 @@
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cstdint>
+
+#include "core/autodiff/evaluate.h"
+#include "core/autodiff/program.h"
+
+namespace metaekf::autodiff {
+
+/// The memory of a running program: an operand's first element, and how far it is to the next step's.
+template <typename T>
+class Memory {
+ public:
+  Memory(T* arena, const T* constants, const Slots<T>& slots) {
+    bases_[kBefore + Operand::kArena] = arena;
+    bases_[kBefore + Operand::kConstants] = const_cast<T*>(constants);
+    std::copy_n(slots.data(), Slots<T>::kMaxSlots, bases_.begin() + kBefore);
+  }
+
+  Places<T> PlacesOf(const Instruction& i) const {
+    return {.out = At(i.out), .a = At(i.a), .b = At(i.b), .c = At(i.c), .panel = bases_[kBefore + Operand::kArena] + std::max<int64_t>(i.panel, 0)};
+  }
+
+ private:
+  T* At(const Operand& operand) const { return bases_[static_cast<size_t>(kBefore + operand.slot)] + operand.offset; }
+
+  static constexpr int32_t kBefore = 2;
+  std::array<T*, kBefore + Slots<T>::kMaxSlots> bases_;
+};
+
+/// The kernel of an instruction, for its shape and for the processor at hand.
+template <typename T>
+Kernel<T> SelectKernel(const Instruction& i);
+
+/// Of an elementwise operation without tiles, or of a product with a panel: in vectors. Null for others.
+template <typename T>
+Kernel<T> SelectVectorKernel(const Instruction& i);
+/// Of an activation.
+template <typename T>
+Kernel<T> SelectActivationKernel(Activation activation, int order);
+
+/// Elements of the panel of a product: op(A), column by column, each with zeros below it up to whole vectors.
+int64_t PanelSize(int32_t rows, int32_t inner);
+/// Lays out the first factor of a product that has a panel.
+template <typename T>
+void MakePanel(const Instruction& i, const Places<T>& at);
+
+}  // namespace metaekf::autodiff

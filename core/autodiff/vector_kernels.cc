@@ -1,0 +1,263 @@
+// Kernels in vectors, with the instruction set chosen at run time.
+//
+// In a recurrence of a small network each step waits for the last, and its values are a few numbers long. What counts there is how many
+// instructions a step takes and how soon its results can be read: a processor hands on what was just stored only to a load that asks for
+// no more than one store wrote. So every kernel reads and writes a column of r rows in the same pieces: whole vectors, then the largest
+// power of two that fits, and so on.
+
+#include <algorithm>
+#include <cstddef>
+
+#include "core/autodiff/kernel.h"
+
+#ifndef METAEKF_PANEL_HEIGHT  // once, not for each instruction set
+#define METAEKF_PANEL_HEIGHT
+namespace metaekf::autodiff {
+/// Rows of a panel for so many rows of a factor: whole vectors of any instruction set.
+constexpr ptrdiff_t PanelHeight(int32_t rows) { return (ptrdiff_t{rows} + 15) / 16 * 16; }
+}  // namespace metaekf::autodiff
+#endif
+
+// Sums stay in registers only where the loops over them are unrolled.
+#undef METAEKF_UNROLL
+#ifdef __clang__
+#define METAEKF_UNROLL _Pragma("clang loop unroll(full)")
+#else
+#define METAEKF_UNROLL _Pragma("GCC unroll 8")
+#endif
+#undef HWY_TARGET_INCLUDE
+#define HWY_TARGET_INCLUDE "core/autodiff/vector_kernels.cc"
+#define HWY_DISABLED_TARGETS (HWY_SSSE3 | HWY_AVX3_DL)  // little gain over their neighbours, long to compile
+#include <hwy/foreach_target.h>
+#include <hwy/highway.h>
+
+HWY_BEFORE_NAMESPACE();
+namespace metaekf::autodiff {
+namespace HWY_NAMESPACE {
+namespace hn = hwy::HWY_NAMESPACE;
+
+// ---- elementwise ----
+
+struct Sum {
+  template <class V>
+  static HWY_INLINE V Apply(V a, V b) {
+    return hn::Add(a, b);
+  }
+};
+
+struct Difference {
+  template <class V>
+  static HWY_INLINE V Apply(V a, V b) {
+    return hn::Sub(a, b);
+  }
+};
+
+struct ElementProduct {
+  template <class V>
+  static HWY_INLINE V Apply(V a, V b) {
+    return hn::Mul(a, b);
+  }
+};
+
+/// out_k = Operation(a_k, b_k), k < count, count below the lanes of two vectors.
+template <class Operation, class D, typename T = hn::TFromD<D>>
+HWY_INLINE void EndOfPairs(D d, int64_t count, const T* a, const T* b, T* out) {
+  const int64_t lanes = static_cast<int64_t>(hn::Lanes(d));
+  if (count >= lanes) {
+    hn::StoreU(Operation::Apply(hn::LoadU(d, a), hn::LoadU(d, b)), d, out);
+    a += lanes, b += lanes, out += lanes, count -= lanes;
+  }
+  if constexpr (hn::MaxLanes(D()) > 1) {
+    if (count > 0) EndOfPairs<Operation>(hn::Half<D>(), count, a, b, out);
+  }
+}
+
+template <class Operation, typename T>
+void Pairs(const Instruction& i, const Places<T>& at) {
+  const hn::ScalableTag<T> d;
+  const int64_t lanes = static_cast<int64_t>(hn::Lanes(d));
+  const T* a = at.a;
+  const T* b = at.b;
+  T* out = at.out;
+  int64_t count = int64_t{i.rows} * i.cols;
+  for (; count >= lanes; count -= lanes, a += lanes, b += lanes, out += lanes) {
+    hn::StoreU(Operation::Apply(hn::LoadU(d, a), hn::LoadU(d, b)), d, out);
+  }
+  EndOfPairs<Operation>(d, count, a, b, out);
+}
+
+/// out = factor · a
+template <typename T>
+HWY_INLINE void Scaled(T factor, const T* a, T* out, int64_t count) {
+  const hn::ScalableTag<T> d;
+  const int64_t lanes = static_cast<int64_t>(hn::Lanes(d));
+  const auto factors = hn::Set(d, factor);
+  int64_t k = 0;
+  for (; k + lanes <= count; k += lanes) hn::StoreU(hn::Mul(factors, hn::LoadU(d, a + k)), d, out + k);
+  for (; k < count; ++k) out[k] = factor * a[k];
+}
+
+template <typename T>
+void Scale(const Instruction& i, const Places<T>& at) {
+  Scaled(T(i.scalar), at.a, at.out, int64_t{i.rows} * i.cols);
+}
+
+template <typename T>
+void ScaleBy(const Instruction& i, const Places<T>& at) {
+  Scaled(*at.a, at.b, at.out, int64_t{i.rows} * i.cols);
+}
+
+// ---- products with a panel ----
+
+/// c = v or addend + v in the first `rows` lanes, rows > 0.
+template <bool kAdd, class D, typename T = hn::TFromD<D>>
+HWY_INLINE void StoreRows(D d, hn::Vec<D> v, int rows, const T* addend, T* c) {
+  const int lanes = static_cast<int>(hn::Lanes(d));
+  if (rows >= lanes) {
+    hn::StoreU(kAdd ? hn::Add(hn::LoadU(d, addend), v) : v, d, c);
+    return;
+  }
+#if HWY_TARGET != HWY_SCALAR
+  if constexpr (hn::MaxLanes(D()) > 1) {
+    const hn::Half<D> half;
+    const int width = lanes / 2;
+    StoreRows<kAdd>(half, hn::LowerHalf(half, v), rows, addend, c);
+    if (rows > width) StoreRows<kAdd>(half, hn::UpperHalf(half, v), rows - width, addend + width, c + width);
+  }
+#endif
+}
+
+/// `rows` rows, which fill more than kVectors − 1 vectors but no more than kVectors, of one column of C. What an element is depends
+/// neither on kVectors nor on the width of vectors.
+template <int kVectors, bool kAdd, class D, typename T = hn::TFromD<D>>
+HWY_INLINE void PanelRows(D d, int rows, int k, const T* HWY_RESTRICT panel, ptrdiff_t height, const T* b, const T* addend, T* c) {
+  const int lanes = static_cast<int>(hn::Lanes(d));
+  // Four sums of each: a single one would wait for itself.
+  constexpr int kSums = 4;
+  hn::Vec<D> sums[kSums][kVectors];
+  METAEKF_UNROLL
+  for (int s = 0; s < kSums; ++s) {
+    METAEKF_UNROLL
+    for (int i = 0; i < kVectors; ++i) sums[s][i] = hn::Zero(d);
+  }
+  int l = 0;
+  for (; l + kSums <= k; l += kSums, panel += kSums * height) {
+    METAEKF_UNROLL
+    for (int s = 0; s < kSums; ++s) {
+      const auto factor = hn::Set(d, b[l + s]);
+      METAEKF_UNROLL
+      for (int i = 0; i < kVectors; ++i) sums[s][i] = hn::MulAdd(hn::Load(d, panel + s * height + i * lanes), factor, sums[s][i]);
+    }
+  }
+  METAEKF_UNROLL
+  for (int s = 0; s < kSums - 1; ++s) {
+    if (l + s < k) {
+      const auto factor = hn::Set(d, b[l + s]);
+      METAEKF_UNROLL
+      for (int i = 0; i < kVectors; ++i) sums[s][i] = hn::MulAdd(hn::Load(d, panel + s * height + i * lanes), factor, sums[s][i]);
+    }
+  }
+  METAEKF_UNROLL
+  for (int i = 0; i < kVectors; ++i, rows -= lanes, addend += lanes, c += lanes) {
+    const auto sum = hn::Add(hn::Add(sums[0][i], sums[1][i]), hn::Add(sums[2][i], sums[3][i]));
+    StoreRows<kAdd>(d, sum, rows, addend, c);
+  }
+}
+
+/// One column of C, of at most sixteen rows, as the steps of small recurrences want it.
+template <int kVectors, bool kAdd, class D>
+void PanelColumn(const Instruction& i, const Places<hn::TFromD<D>>& at) {
+  PanelRows<kVectors, kAdd>(D(), i.rows, i.inner, at.panel, PanelHeight(1), at.b, at.c, at.out);
+}
+
+/// C ← op(A) B or D + op(A) B.
+template <bool kAdd, typename T>
+void PanelProduct(const Instruction& i, const Places<T>& at) {
+  const hn::ScalableTag<T> d;
+  const int lanes = static_cast<int>(hn::Lanes(d));
+  const ptrdiff_t height = PanelHeight(i.rows);
+  for (int32_t j = 0; j < i.cols; ++j) {
+    const T* b = at.b + ptrdiff_t{j} * i.b.ld;
+    const T* addend = at.c + ptrdiff_t{j} * i.c.ld;
+    T* c = at.out + ptrdiff_t{j} * i.out.ld;
+    int row = 0;
+    for (; i.rows - row > lanes; row += 2 * lanes) {
+      PanelRows<2, kAdd>(d, i.rows - row, i.inner, at.panel + row, height, b, addend + row, c + row);
+    }
+    if (row < i.rows) PanelRows<1, kAdd>(d, i.rows - row, i.inner, at.panel + row, height, b, addend + row, c + row);
+  }
+}
+
+template <bool kAdd, typename T>
+Kernel<T> SelectPanelProduct(const Instruction& i) {
+  using Wide = hn::ScalableTag<T>;
+  using Narrow = hn::CappedTag<T, 4>;
+  if (i.cols > 1 || PanelHeight(i.rows) > PanelHeight(1)) return PanelProduct<kAdd, T>;
+  if (i.rows <= static_cast<int>(hn::Lanes(Narrow()))) return PanelColumn<1, kAdd, Narrow>;
+  if (i.rows <= static_cast<int>(hn::Lanes(Wide()))) return PanelColumn<1, kAdd, Wide>;
+  if (i.rows <= 2 * static_cast<int>(hn::Lanes(Wide()))) return PanelColumn<2, kAdd, Wide>;
+  return PanelProduct<kAdd, T>;
+}
+
+template <typename T>
+Kernel<T> Select(const Instruction& i) {
+  const bool tiled = i.a.tile_width != 0 || i.b.tile_width != 0;
+  switch (i.op) {
+    case Opcode::kMatMul:
+      return i.panel >= 0 ? SelectPanelProduct<false, T>(i) : nullptr;
+    case Opcode::kMatMulAdd:
+      return i.panel >= 0 ? SelectPanelProduct<true, T>(i) : nullptr;
+    case Opcode::kAdd:
+      return tiled ? nullptr : Pairs<Sum, T>;
+    case Opcode::kSub:
+      return tiled ? nullptr : Pairs<Difference, T>;
+    case Opcode::kMul:
+      return tiled ? nullptr : Pairs<ElementProduct, T>;
+    case Opcode::kScale:
+      return Scale<T>;
+    case Opcode::kScaleBy:
+      return ScaleBy<T>;
+    default:
+      return nullptr;
+  }
+}
+
+Kernel<float> SelectFloat(const Instruction& i) { return Select<float>(i); }
+Kernel<double> SelectDouble(const Instruction& i) { return Select<double>(i); }
+
+}  // namespace HWY_NAMESPACE
+}  // namespace metaekf::autodiff
+HWY_AFTER_NAMESPACE();
+
+#if HWY_ONCE
+namespace metaekf::autodiff {
+
+HWY_EXPORT(SelectFloat);
+HWY_EXPORT(SelectDouble);
+
+template <>
+Kernel<float> SelectVectorKernel(const Instruction& i) {
+  return HWY_DYNAMIC_DISPATCH(SelectFloat)(i);
+}
+
+template <>
+Kernel<double> SelectVectorKernel(const Instruction& i) {
+  return HWY_DYNAMIC_DISPATCH(SelectDouble)(i);
+}
+
+int64_t PanelSize(int32_t rows, int32_t inner) { return int64_t{PanelHeight(rows)} * inner; }
+
+template <typename T>
+void MakePanel(const Instruction& i, const Places<T>& at) {
+  const T* a = at.a;
+  T* panel = at.panel;
+  for (int32_t l = 0; l < i.inner; ++l, panel += PanelHeight(i.rows)) {
+    std::fill_n(panel, PanelHeight(i.rows), T(0));
+    for (int32_t r = 0; r < i.rows; ++r) panel[r] = i.transpose_a ? a[l + ptrdiff_t{r} * i.a.ld] : a[r + ptrdiff_t{l} * i.a.ld];
+  }
+}
+template void MakePanel(const Instruction&, const Places<float>&);
+template void MakePanel(const Instruction&, const Places<double>&);
+
+}  // namespace metaekf::autodiff
+#endif  // HWY_ONCE

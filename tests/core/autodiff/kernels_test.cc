@@ -1,0 +1,123 @@
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <cstdlib>
+#include <limits>
+#include <memory>
+#include <vector>
+
+#include "core/autodiff/kernel.h"
+#include "core/base/rng.h"
+#include "tests/support/instruction_sets.h"
+
+namespace metaekf::autodiff {
+namespace {
+
+class KernelsTest : public support::InstructionSetTest {};
+
+// Matrices lie in vectors of just their size, so that a sanitizer sees whoever reads or writes past them.
+template <typename T>
+std::vector<T> Random(int64_t size, base::Rng* rng) {
+  std::vector<T> values(static_cast<size_t>(size));
+  for (T& value : values) value = static_cast<T>(rng->Normal());
+  return values;
+}
+
+template <typename T>
+std::vector<T> RunKernel(const Instruction& i, Places<T> at, std::vector<T> out) {
+  at.out = out.data();
+  SelectKernel<T>(i)(i, at);
+  return out;
+}
+
+/// Against sums one by one, with and without an addend, that of the result too.
+template <typename T>
+void CheckPanelProducts() {
+  base::Rng rng(11);
+  const auto size = [&rng](int32_t most) { return 1 + static_cast<int32_t>(rng.Index(static_cast<size_t>(most))); };
+  for (int trial = 0; trial < 400; ++trial) {
+    const int32_t m = size(trial % 2 == 0 ? 18 : 70), n = size(trial % 3 == 0 ? 4 : 1), k = size(20);
+    Instruction i{.op = Opcode::kMatMul, .rows = m, .cols = n, .inner = k, .transpose_a = trial % 2 == 1, .panel = 0};
+    i.a.ld = i.transpose_a ? k : m;
+    i.b.ld = k;
+    i.c.ld = i.out.ld = m;
+    const std::vector<T> a = Random<T>(int64_t{m} * k, &rng), b = Random<T>(int64_t{k} * n, &rng), c = Random<T>(int64_t{m} * n, &rng);
+    const std::unique_ptr<T, decltype(&std::free)> panel(
+        static_cast<T*>(std::aligned_alloc(128, (static_cast<size_t>(PanelSize(m, k)) * sizeof(T) + 127) / 128 * 128)), &std::free);
+    Places<T> at{.out = nullptr, .a = a.data(), .b = b.data(), .c = c.data(), .panel = panel.get()};
+    MakePanel(i, at);
+    const std::vector<T> plain = RunKernel(i, at, c);
+    i.op = Opcode::kMatMulAdd;
+    const std::vector<T> added = RunKernel(i, at, std::vector<T>(c.size()));
+    std::vector<T> in_place = c;
+    at.c = at.out = in_place.data();
+    SelectKernel<T>(i)(i, at);
+    EXPECT_EQ(added, in_place);
+    for (int32_t col = 0; col < n; ++col) {
+      for (int32_t row = 0; row < m; ++row) {
+        double sum = 0, size_of_terms = 0;
+        for (int32_t l = 0; l < k; ++l) {
+          const double term = static_cast<double>(a[static_cast<size_t>(i.transpose_a ? l + row * k : row + l * m)]) *
+                              static_cast<double>(b[static_cast<size_t>(l + col * k)]);
+          sum += term;
+          size_of_terms += std::fabs(term);
+        }
+        const size_t e = static_cast<size_t>(row + col * m);
+        const double addend = static_cast<double>(c[e]);
+        const double tolerance = 4 * k * std::numeric_limits<T>::epsilon() * (size_of_terms + std::fabs(addend));
+        ASSERT_NEAR(plain[e], sum, tolerance) << m << " × " << n << " × " << k;
+        ASSERT_NEAR(added[e], sum + addend, tolerance) << m << " × " << n << " × " << k;
+      }
+    }
+  }
+}
+
+TEST_P(KernelsTest, PanelProductsInFloat) { CheckPanelProducts<float>(); }
+TEST_P(KernelsTest, PanelProductsInDouble) { CheckPanelProducts<double>(); }
+
+/// Each element is one operation: equal to the last bit, whatever the size.
+template <typename T>
+void CheckElementwise() {
+  base::Rng rng(12);
+  for (int32_t count = 1; count < 70; ++count) {
+    const std::vector<T> a = Random<T>(count, &rng), b = Random<T>(count, &rng), none(static_cast<size_t>(count));
+    const Places<T> at{.out = nullptr, .a = a.data(), .b = b.data(), .c = nullptr, .panel = nullptr};
+    const auto run = [&](Opcode op) { return RunKernel({.op = op, .rows = count, .cols = 1, .scalar = 0.3}, at, none); };
+    const std::vector<T> sum = run(Opcode::kAdd), difference = run(Opcode::kSub), product = run(Opcode::kMul), scaled = run(Opcode::kScale),
+                         scaled_by = run(Opcode::kScaleBy);
+    for (size_t k = 0; k < a.size(); ++k) {
+      ASSERT_EQ(sum[k], a[k] + b[k]);
+      ASSERT_EQ(difference[k], a[k] - b[k]);
+      ASSERT_EQ(product[k], a[k] * b[k]);
+      ASSERT_EQ(scaled[k], T(0.3) * a[k]);
+      ASSERT_EQ(scaled_by[k], a[0] * b[k]);
+    }
+  }
+}
+
+TEST_P(KernelsTest, ElementwiseInFloat) { CheckElementwise<float>(); }
+TEST_P(KernelsTest, ElementwiseInDouble) { CheckElementwise<double>(); }
+
+TEST(KernelsWithoutVectorsTest, SumsOfTilesOfAnySize) {
+  base::Rng rng(13);
+  for (int trial = 0; trial < 200; ++trial) {
+    const auto size = [&rng](size_t most) { return 1 + static_cast<int32_t>(rng.Index(most)); };
+    const int32_t rows = size(trial % 2 == 0 ? 3 : 80), width = size(3), count = size(300), blocks = size(3);
+    const int64_t stretch = int64_t{rows} * width;
+    const std::vector<double> a = Random<double>(stretch * count * blocks, &rng);
+    const Places<double> at{.out = nullptr, .a = a.data(), .b = nullptr, .c = nullptr, .panel = nullptr};
+    const std::vector<double> sums = RunKernel({.op = Opcode::kSumTiles, .rows = rows, .cols = width * count * blocks, .width = width, .count = count},
+                                         at, std::vector<double>(static_cast<size_t>(stretch * blocks)));
+    for (size_t e = 0; e < sums.size(); ++e) {
+      const size_t block = e / static_cast<size_t>(stretch), place = e % static_cast<size_t>(stretch);
+      double sum = 0;
+      for (int32_t tile = 0; tile < count; ++tile) sum += a[(block * static_cast<size_t>(count) + static_cast<size_t>(tile)) * static_cast<size_t>(stretch) + place];
+      ASSERT_NEAR(sums[e], sum, 1e-12 * count);
+    }
+  }
+}
+
+INSTANTIATE_TEST_SUITE_P(Targets, KernelsTest, support::InstructionSets(), support::NameOfInstructionSet);
+
+}  // namespace
+}  // namespace metaekf::autodiff
