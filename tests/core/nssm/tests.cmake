@@ -1,7 +1,7 @@
 metaekf_test(core/nssm/constraint_spec_test.cc DEPS metaekf::core_nssm)
 metaekf_test(core/nssm/least_squares_test.cc DEPS metaekf::core_nssm)
 metaekf_test(core/nssm/linearise_test.cc DEPS metaekf::core_nssm)
-metaekf_test(core/nssm/loss_test.cc DEPS metaekf::core_nssm)
+metaekf_test(core/nssm/loss_test.cc LABELS slow DEPS metaekf::core_nssm)
 metaekf_test(core/nssm/model_file_test.cc DEPS metaekf::core_nssm)
 metaekf_test(core/nssm/predict_test.cc DEPS metaekf::core_filter)
 metaekf_test(core/nssm/start_fit_test.cc DEPS metaekf::core_nssm)
