@@ -9,6 +9,7 @@ bool IsSmooth(Activation activation) {
     case Activation::kMish:
     case Activation::kSoftplus:
     case Activation::kSine:
+    case Activation::kSigmoid:
     case Activation::kTanhSlope:
       return true;
     default:

@@ -17,6 +17,7 @@ enum class Activation : uint8_t {
   kMish,      // z tanh(log(1 + eᶻ))
   kSoftplus,  // log(1 + eᶻ)
   kSine,      // sin z, |z| below 10⁴
+  kSigmoid,   // 1 / (1 + e^{−z}), which swish and its derivatives are made of
   kTanhSlope,  // 1 − z²: the slope of tanh where its value is z
 };
 

@@ -38,7 +38,8 @@ template <class D>
 V<D> Sigmoid(D d, V<D> z) {
   const double cap = sizeof(hn::TFromD<D>) == 4 ? 87.0 : 708.0;
   const V<D> one = Const(d, 1);
-  return hn::Div(one, hn::Add(one, hn::Exp(d, hn::Min(hn::Neg(z), Const(d, cap)))));
+  const V<D> s = hn::Div(one, hn::Add(one, hn::Exp(d, hn::Min(hn::Neg(z), Const(d, cap)))));
+  return hn::IfThenElse(hn::IsNaN(z), z, s);  // the exponential of no number is zero
 }
 
 /// log(1 + eᶻ) = max(z, 0) + log(1 + e^{−|z|}).
@@ -137,10 +138,23 @@ struct TanhSlope {
   }
 };
 
-struct Swish {
+struct SigmoidFunction {
   template <int order, class D>
   static V<D> Apply(D d, V<D> z, V<D>) {
     const V<D> s = Sigmoid(d, z);
+    if constexpr (order == 0) return s;
+    return SigmoidDerivative<order>(d, s);
+  }
+};
+
+struct Swish {
+  template <int order, class D>
+  static V<D> Apply(D d, V<D> z, V<D>) {
+    return From<order>(d, z, Sigmoid(d, z));
+  }
+  /// @param s  the sigmoid of z.
+  template <int order, class D>
+  static V<D> From(D d, V<D> z, V<D> s) {
     if constexpr (order == 0) return hn::Mul(z, s);
     if constexpr (order == 1) return hn::MulAdd(z, SigmoidDerivative<1>(d, s), s);
     return hn::MulAdd(z, SigmoidDerivative<order>(d, s), hn::Mul(Const(d, order), SigmoidDerivative<order - 1>(d, s)));
@@ -222,6 +236,19 @@ void MapKernel(const Instruction& i, const Places<T>& at) {
   map(T(i.scalar), at.a, at.out, static_cast<size_t>(int64_t{i.rows} * i.cols));
 }
 
+/// Swish, whose second operand is the sigmoid.
+template <int order, typename T>
+void SwishKernel(const Instruction& i, const Places<T>& at) {
+  const hn::ScalableTag<T> d;
+  const size_t lanes = hn::Lanes(d), count = static_cast<size_t>(int64_t{i.rows} * i.cols);
+  size_t k = 0;
+  for (; k + lanes <= count; k += lanes) {
+    hn::StoreU(Swish::From<order>(d, hn::LoadU(d, at.a + k), hn::LoadU(d, at.b + k)), d, at.out + k);
+  }
+  const hn::CappedTag<T, 1> one;
+  for (; k < count; ++k) hn::StoreU(Swish::From<order>(one, hn::LoadU(one, at.a + k), hn::LoadU(one, at.b + k)), one, at.out + k);
+}
+
 template <class Function, int order, typename T>
 constexpr Forms<T> FormsOf() {
   return {Map<Function, order, T>, MapKernel<T, Map<Function, order, T>>};
@@ -247,13 +274,15 @@ Forms<T> OfOrder(Activation activation) {
     case Activation::kTanh:
       return FormsOf<TanhFunction, order, T>();
     case Activation::kSwish:
-      return FormsOf<Swish, order, T>();
+      return {Map<Swish, order, T>, SwishKernel<order, T>};
     case Activation::kMish:
       return FormsOf<Mish, order, T>();
     case Activation::kSoftplus:
       return FormsOf<SoftplusFunction, order, T>();
     case Activation::kSine:
       return FormsOf<Sine, order, T>();
+    case Activation::kSigmoid:
+      return FormsOf<SigmoidFunction, order, T>();
     case Activation::kTanhSlope:
       return FormsOf<TanhSlope, order, T>();
   }

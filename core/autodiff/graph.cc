@@ -117,10 +117,12 @@ Value Graph::Apply(Activation activation, double parameter, int order, Value a) 
   if (activation == Activation::kIdentity) return order == 0 ? a : Constant(order == 1 ? 1 : 0, rows, cols);
   if (DerivativeIsZero(activation, order)) return Constant(0, rows, cols);
   assert(order <= kMaxDerivative);
+  std::vector<Value> inputs = {a};
+  if (activation == Activation::kSwish) inputs.push_back(Apply(Activation::kSigmoid, 0, 0, a));  // once for all orders
   return Append({.op = Op::kActivation,
                  .rows = rows,
                  .cols = cols,
-                 .inputs = {a},
+                 .inputs = std::move(inputs),
                  .activation = activation,
                  .order = order,
                  .scalar = parameter});

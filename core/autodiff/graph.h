@@ -23,7 +23,7 @@ enum class Op : uint8_t {
   kScale,       // scalar · A
   kScaleBy,     // a · B, a being 1 × 1
   kDot,         // Σ A ⊙ B, 1 × 1
-  kActivation,  // σ^(order)(A)
+  kActivation,  // σ^(order)(A); swish has A's sigmoid for a second input, as a help
   kSoftmax,     // e^a / Σ e^a, column by column
   kTile,        // each block of `width` columns, `count` times in a row
   kSumTiles,    // the transpose of kTile: sums runs of `count` blocks

@@ -34,7 +34,7 @@ class Memory {
 template <typename T>
 Kernel<T> SelectKernel(const Instruction& i);
 
-/// Of an elementwise operation without tiles, or of a product with a panel: in vectors. Null for others.
+/// Of an elementwise operation without tiles, of a product with a panel or of few elements: in vectors. Null for others.
 template <typename T>
 Kernel<T> SelectVectorKernel(const Instruction& i);
 /// Of an activation.

@@ -199,14 +199,71 @@ Kernel<T> SelectPanelProduct(const Instruction& i) {
   return PanelProduct<kAdd, T>;
 }
 
+// ---- small products ----
+
+/// aᵀb of kDepth elements, or of `depth` if kDepth is 0.
+template <int kDepth, typename T>
+HWY_INLINE T ScalarProduct(int depth, const T* HWY_RESTRICT a, const T* HWY_RESTRICT b) {
+  T sum = 0;
+  if constexpr (kDepth > 0) {
+    METAEKF_UNROLL
+    for (int l = 0; l < kDepth; ++l) sum += a[l] * b[l];
+  } else {
+    const hn::ScalableTag<T> d;
+    const int lanes = static_cast<int>(hn::Lanes(d));
+    auto sums = hn::Zero(d);
+    int l = 0;
+    for (; l + lanes <= depth; l += lanes) sums = hn::MulAdd(hn::LoadU(d, a + l), hn::LoadU(d, b + l), sums);
+    sum = hn::GetLane(hn::SumOfLanes(d, sums));
+    for (; l < depth; ++l) sum += a[l] * b[l];
+  }
+  return sum;
+}
+
+/// C ← AᵀB or D + AᵀB of few elements, as an extended Kalman filter of a small model has by the dozen.
+template <int kDepth, bool kAdd, typename T>
+void SmallProduct(const Instruction& i, const Places<T>& at) {
+  const int rows = i.rows, depth = i.inner;
+  const ptrdiff_t lda = i.a.ld;
+  const T* b = at.b;
+  const T* addend = at.c;
+  T* c = at.out;
+  for (int32_t j = 0; j < i.cols; ++j, b += i.b.ld, addend += i.c.ld, c += i.out.ld) {
+    const T* a = at.a;
+    for (int r = 0; r < rows; ++r, a += lda) {
+      const T sum = ScalarProduct<kDepth>(depth, a, b);
+      c[r] = kAdd ? addend[r] + sum : sum;
+    }
+  }
+}
+
+template <bool kAdd, typename T>
+Kernel<T> SelectProduct(const Instruction& i) {
+  if (i.panel >= 0) return SelectPanelProduct<kAdd, T>(i);
+  constexpr int64_t kFew = 256;  // multiplications
+  if (!i.transpose_a || i.transpose_b || (kAdd && i.c.tile_width != 0) || int64_t{i.rows} * i.cols * i.inner > kFew) return nullptr;
+  switch (i.inner) {
+    case 1:
+      return SmallProduct<1, kAdd, T>;
+    case 2:
+      return SmallProduct<2, kAdd, T>;
+    case 3:
+      return SmallProduct<3, kAdd, T>;
+    case 4:
+      return SmallProduct<4, kAdd, T>;
+    default:
+      return SmallProduct<0, kAdd, T>;
+  }
+}
+
 template <typename T>
 Kernel<T> Select(const Instruction& i) {
   const bool tiled = i.a.tile_width != 0 || i.b.tile_width != 0;
   switch (i.op) {
     case Opcode::kMatMul:
-      return i.panel >= 0 ? SelectPanelProduct<false, T>(i) : nullptr;
+      return SelectProduct<false, T>(i);
     case Opcode::kMatMulAdd:
-      return i.panel >= 0 ? SelectPanelProduct<true, T>(i) : nullptr;
+      return SelectProduct<true, T>(i);
     case Opcode::kAdd:
       return tiled ? nullptr : Pairs<Sum, T>;
     case Opcode::kSub:

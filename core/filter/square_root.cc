@@ -32,7 +32,8 @@ void LowerTriangularise(Ref<MatrixXd> a) {
       const double norm = std::sqrt(head * head + squared);
       const double v0 = head <= 0 ? head - norm : -squared / (head + norm);  // no cancellation
       const double beta = 2 * v0 * v0 / (squared + v0 * v0);
-      for (Index j = i + 1; j < cols; ++j) a(i, j) /= v0;  // the reflection's vector is (1, this)
+      const double inverse = 1 / v0;
+      for (Index j = i + 1; j < cols; ++j) a(i, j) *= inverse;  // the reflection's vector is (1, this)
       // Down the columns, as they lie in memory, for some rows at a time.
       for (Index first = i + 1; first < rows; first += kRowsAtATime) {
         const Index count = std::min(kRowsAtATime, rows - first);

@@ -403,9 +403,14 @@ template void MatMul(bool, bool, int32_t, int32_t, int32_t, const float*, int32_
 template void MatMul(bool, bool, int32_t, int32_t, int32_t, const double*, int32_t, const double*, int32_t, double*, int32_t, bool);
 
 void AddSquare(int32_t m, int32_t k, const double* a, int32_t lda, double* c, int32_t ldc) {
-  constexpr int32_t kWidth = 48;
-  for (int32_t j = 0; j < m; j += kWidth) {
-    MatMul(false, true, m - j, std::min(kWidth, m - j), k, a + j, lda, a + j, lda, c + j + int64_t{j} * ldc, ldc, true);
+  constexpr int32_t kWidth = 24;  // of a strip of C; what it has above the diagonal is computed for nothing
+  constexpr int32_t kSamples = 96;  // so many columns of A that what a strip reads stays near
+  for (int32_t l = 0; l < k; l += kSamples) {
+    const double* part = a + int64_t{l} * lda;
+    const int32_t samples = std::min(kSamples, k - l);
+    for (int32_t j = 0; j < m; j += kWidth) {
+      MatMul(false, true, m - j, std::min(kWidth, m - j), samples, part + j, lda, part + j, lda, c + j + int64_t{j} * ldc, ldc, true);
+    }
   }
 }
 

@@ -35,25 +35,30 @@ Value Block::Activate(Graph* graph, const ParameterValues& parameters, size_t la
   return graph->Scale(graph->Apply(Activation::kSwish, 1, 0, scaled), 1 / beta);
 }
 
-Value Block::ApplyFrom(Graph* graph, const ParameterValues& parameters, Value z) const {
+Value Block::ApplyFrom(Graph* graph, const ParameterValues& parameters, Value z, Value shift) const {
   for (size_t layer = 1; layer < weights_.size(); ++layer) {
     z = Activate(graph, parameters, layer - 1, z);
-    z = AddBias(graph, parameters, layer, graph->MatMul(parameters[weights_[layer]], z, true));
+    const Value product = graph->MatMul(parameters[weights_[layer]], z, true);
+    if (layer + 1 < weights_.size() || shift == autodiff::kNoValue) {
+      z = AddBias(graph, parameters, layer, product);
+    } else {
+      return graph->Add(product, AddBias(graph, parameters, layer, shift));
+    }
   }
-  return z;
+  return graph->AddOrEither(z, shift);
 }
 
-Value Block::Apply(Graph* graph, const ParameterValues& parameters, Value x) const {
+Value Block::Apply(Graph* graph, const ParameterValues& parameters, Value x, Value shift) const {
   const Value first = graph->MatMul(parameters[weights_[0]], x, true);
-  return ApplyFrom(graph, parameters, AddBias(graph, parameters, 0, first));
+  return ApplyFrom(graph, parameters, AddBias(graph, parameters, 0, first), shift);
 }
 
-Value Block::ApplyStacked(Graph* graph, const ParameterValues& parameters, Value a, Value b) const {
+Value Block::ApplyStacked(Graph* graph, const ParameterValues& parameters, Value a, Value b, Value shift) const {
   const Value weight = parameters[weights_[0]];
   const int32_t a_rows = graph->node(a).rows, b_rows = graph->node(b).rows;
   const Value from_b = graph->MatMul(graph->SliceRows(weight, a_rows, b_rows), b, true);
   const Value from_a = graph->MatMul(graph->SliceRows(weight, 0, a_rows), a, true);
-  return ApplyFrom(graph, parameters, graph->Add(AddBias(graph, parameters, 0, from_b), from_a));
+  return ApplyFrom(graph, parameters, graph->Add(AddBias(graph, parameters, 0, from_b), from_a), shift);
 }
 
 void Block::Initialise(const ParameterLayout& layout, base::Rng* rng, std::span<double> parameters) const {

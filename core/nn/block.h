@@ -32,13 +32,16 @@ class Block {
   /// Appends the parameters `name`.0.weight, `name`.0.bias, … to the layout.
   Block(const std::string& name, const BlockSpec& spec, int32_t in, int32_t out, ParameterLayout* layout);
 
-  /// @param x  in × b. @return out × b.
-  autodiff::Value Apply(autodiff::Graph* graph, const ParameterValues& parameters, autodiff::Value x) const;
+  /// @param x      in × b.
+  /// @param shift  out × b, added to the result; before the last product, for which a recurrence waits.
+  /// @return out × b.
+  autodiff::Value Apply(autodiff::Graph* graph, const ParameterValues& parameters, autodiff::Value x,
+                        autodiff::Value shift = autodiff::kNoValue) const;
 
   /// Apply([a; b]) without stacking: the first layer's weight meets its parts one by one, so that the part that
   /// does not depend on a recurrence can leave its loop.
   autodiff::Value ApplyStacked(autodiff::Graph* graph, const ParameterValues& parameters, autodiff::Value a,
-                               autodiff::Value b) const;
+                               autodiff::Value b, autodiff::Value shift = autodiff::kNoValue) const;
 
   /// Draws weights with standard deviation gain/√in (gain √2 after ReLU-like activations), biases zero; the last layer's
   /// weights are multiplied by output_scale, every β is what it begins with.
@@ -47,7 +50,8 @@ class Block {
  private:
   /// σ of hidden layer `layer`.
   autodiff::Value Activate(autodiff::Graph* graph, const ParameterValues& parameters, size_t layer, autodiff::Value z) const;
-  autodiff::Value ApplyFrom(autodiff::Graph* graph, const ParameterValues& parameters, autodiff::Value first) const;
+  /// From what the first layer's function is applied to.
+  autodiff::Value ApplyFrom(autodiff::Graph* graph, const ParameterValues& parameters, autodiff::Value first, autodiff::Value shift) const;
   autodiff::Value AddBias(autodiff::Graph* graph, const ParameterValues& parameters, size_t layer,
                           autodiff::Value z) const;
 

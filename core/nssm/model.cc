@@ -130,19 +130,20 @@ Value ModelGraph::Encode(Value start, Value input) const {
 Value ModelGraph::Advance(Value latent, Value input) const {
   const TransitionSpec& spec = model_.spec_.transition;
   const bool takes_input = spec.form != TransitionForm::kAutonomous && model_.spec_.input_size > 0;
-  Value next = spec.form == TransitionForm::kJoint && takes_input
-                   ? model_.transition_.ApplyStacked(graph_, parameters_, latent, input)
-                   : model_.transition_.Apply(graph_, parameters_, latent);
-  if (spec.form == TransitionForm::kAdditive && takes_input) {
-    next = graph_->Add(model_.transition_input_.Apply(graph_, parameters_, input), next);
-  }
-  next = graph_->Scale(next, spec.increment_scale);
-  if (spec.bypass == Bypass::kSkip) next = graph_->Add(next, latent);
+  const bool joint = spec.form == TransitionForm::kJoint && takes_input;
+  const Value from_input =
+      spec.form == TransitionForm::kAdditive && takes_input ? model_.transition_input_.Apply(graph_, parameters_, input) : kNoValue;
+  Value bypass = kNoValue;
+  if (spec.bypass == Bypass::kSkip) bypass = latent;
   if (spec.bypass == Bypass::kLinear) {
-    if (takes_input) next = graph_->Add(next, graph_->MatMul(parameters_[model_.input_bypass_], input, true));
-    next = graph_->Add(next, graph_->MatMul(parameters_[model_.state_bypass_], latent, true));
+    if (takes_input) bypass = graph_->MatMul(parameters_[model_.input_bypass_], input, true);
+    bypass = graph_->AddOrEither(bypass, graph_->MatMul(parameters_[model_.state_bypass_], latent, true));
   }
-  return next;
+  const bool scaled = spec.increment_scale != 1;
+  const Value shift = scaled ? from_input : graph_->AddOrEither(from_input, bypass);
+  const Value increment = joint ? model_.transition_.ApplyStacked(graph_, parameters_, latent, input, shift)
+                                : model_.transition_.Apply(graph_, parameters_, latent, shift);
+  return scaled ? graph_->AddOrEither(graph_->Scale(increment, spec.increment_scale), bypass) : increment;
 }
 
 Value ModelGraph::State(Value latent) const {

@@ -20,7 +20,8 @@ namespace {
 
 constexpr std::chrono::seconds kSlowReader(10);      // a response that waits longer ends the stream
 constexpr std::chrono::milliseconds kSweepPeriod(500);
-constexpr std::chrono::microseconds kLongReaction(100);
+// Longer batches go to threads of their own. To wake one costs as much as 64 samples of a small model.
+constexpr std::chrono::microseconds kLongReaction(200);
 constexpr size_t kMaxHeavyBatches = 20'000;  // each stream has one at most
 
 absl::Status TakenOver() {

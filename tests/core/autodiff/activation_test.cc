@@ -12,7 +12,7 @@ namespace {
 
 constexpr Activation kAll[] = {Activation::kIdentity, Activation::kRelu,  Activation::kLeakyRelu,
                                Activation::kElu,      Activation::kSelu,  Activation::kTanh,
-                               Activation::kSwish,    Activation::kMish,  Activation::kSoftplus, Activation::kSine, Activation::kTanhSlope};
+                               Activation::kSwish,    Activation::kMish,  Activation::kSoftplus, Activation::kSine, Activation::kSigmoid, Activation::kTanhSlope};
 
 double Value(Activation activation, int order, double z, double a) {
   double out;

@@ -75,6 +75,46 @@ void CheckPanelProducts() {
 TEST_P(KernelsTest, PanelProductsInFloat) { CheckPanelProducts<float>(); }
 TEST_P(KernelsTest, PanelProductsInDouble) { CheckPanelProducts<double>(); }
 
+/// Products with few elements, of either factor transposed or not, with gaps between columns.
+template <typename T>
+void CheckSmallProducts() {
+  base::Rng rng(14);
+  const auto size = [&rng](int32_t most) { return 1 + static_cast<int32_t>(rng.Index(static_cast<size_t>(most))); };
+  for (int trial = 0; trial < 600; ++trial) {
+    const int32_t m = size(18), n = size(3), k = size(trial % 2 == 0 ? 5 : 20), gap = trial % 3;
+    Instruction i{.op = Opcode::kMatMul, .rows = m, .cols = n, .inner = k, .transpose_a = trial % 4 != 0, .transpose_b = trial % 5 == 0};
+    i.a.ld = (i.transpose_a ? k : m) + gap;
+    i.b.ld = (i.transpose_b ? n : k) + gap;
+    i.c.ld = i.out.ld = m;
+    const auto elements = [gap](int32_t ld, int32_t columns) { return int64_t{ld} * columns - gap; };
+    const std::vector<T> a = Random<T>(elements(i.a.ld, i.transpose_a ? m : k), &rng), b = Random<T>(elements(i.b.ld, i.transpose_b ? k : n), &rng),
+                         c = Random<T>(int64_t{m} * n, &rng);
+    const Places<T> at{.out = nullptr, .a = a.data(), .b = b.data(), .c = c.data(), .panel = nullptr};
+    const std::vector<T> plain = RunKernel(i, at, c);
+    i.op = Opcode::kMatMulAdd;
+    const std::vector<T> added = RunKernel(i, at, std::vector<T>(c.size()));
+    for (int32_t col = 0; col < n; ++col) {
+      for (int32_t row = 0; row < m; ++row) {
+        double sum = 0, size_of_terms = 0;
+        for (int32_t l = 0; l < k; ++l) {
+          const double term = static_cast<double>(a[static_cast<size_t>(i.transpose_a ? l + row * i.a.ld : row + l * i.a.ld)]) *
+                              static_cast<double>(b[static_cast<size_t>(i.transpose_b ? col + l * i.b.ld : l + col * i.b.ld)]);
+          sum += term;
+          size_of_terms += std::fabs(term);
+        }
+        const size_t e = static_cast<size_t>(row + col * m);
+        const double addend = static_cast<double>(c[e]);
+        const double tolerance = 4 * k * std::numeric_limits<T>::epsilon() * (size_of_terms + std::fabs(addend));
+        ASSERT_NEAR(plain[e], sum, tolerance) << m << " × " << n << " × " << k;
+        ASSERT_NEAR(added[e], sum + addend, tolerance) << m << " × " << n << " × " << k;
+      }
+    }
+  }
+}
+
+TEST_P(KernelsTest, SmallProductsInFloat) { CheckSmallProducts<float>(); }
+TEST_P(KernelsTest, SmallProductsInDouble) { CheckSmallProducts<double>(); }
+
 /// Each element is one operation: equal to the last bit, whatever the size.
 template <typename T>
 void CheckElementwise() {

@@ -99,6 +99,10 @@ T Apply(Activation activation, T a, T z) {
       return SoftplusDerivative<order>(z);
     case Activation::kSine:
       return order == 0 ? std::sin(z) : order == 1 ? std::cos(z) : order == 2 ? -std::sin(z) : -std::cos(z);
+    case Activation::kSigmoid: {
+      const SigmoidJet<T> s(z);
+      return order == 0 ? s.s : order == 1 ? s.d1 : order == 2 ? s.d2 : s.d3;
+    }
     case Activation::kTanhSlope:
       return order == 0 ? 1 - z * z : order == 1 ? -2 * z : order == 2 ? T(-2) : T(0);
     default:
