@@ -9,7 +9,7 @@
 
 namespace metaekf::autodiff {
 
-/// The memory of a running program: an operand's first element, and how far it is to the next step's.
+/// The memory of a running program, in which instructions find their operands.
 template <typename T>
 class Memory {
  public:
