@@ -9,6 +9,7 @@
 #include <cstddef>
 
 #include "core/autodiff/kernel.h"
+#include "core/linalg/unroll.h"
 
 #ifndef METAEKF_PANEL_HEIGHT  // once, not for each instruction set
 #define METAEKF_PANEL_HEIGHT
@@ -18,13 +19,6 @@ constexpr ptrdiff_t PanelHeight(int32_t rows) { return (ptrdiff_t{rows} + 15) / 
 }  // namespace metaekf::autodiff
 #endif
 
-// Sums stay in registers only where the loops over them are unrolled.
-#undef METAEKF_UNROLL
-#ifdef __clang__
-#define METAEKF_UNROLL _Pragma("clang loop unroll(full)")
-#else
-#define METAEKF_UNROLL _Pragma("GCC unroll 8")
-#endif
 #undef HWY_TARGET_INCLUDE
 #define HWY_TARGET_INCLUDE "core/autodiff/vector_kernels.cc"
 #define HWY_DISABLED_TARGETS (HWY_SSSE3 | HWY_AVX3_DL)  // little gain over their neighbours, long to compile

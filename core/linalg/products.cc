@@ -13,13 +13,8 @@
 #include <cstring>
 #include <type_traits>
 
-// Sums stay in registers only where the loops over them are unrolled.
-#undef METAEKF_UNROLL
-#ifdef __clang__
-#define METAEKF_UNROLL _Pragma("clang loop unroll(full)")
-#else
-#define METAEKF_UNROLL _Pragma("GCC unroll 8")
-#endif
+#include "core/linalg/unroll.h"
+
 #undef HWY_TARGET_INCLUDE
 #define HWY_TARGET_INCLUDE "core/linalg/products.cc"
 #define HWY_DISABLED_TARGETS (HWY_SSSE3 | HWY_AVX3_DL)  // little gain over their neighbours, long to compile

@@ -30,7 +30,29 @@ std::vector<T> RunKernel(const Instruction& i, Places<T> at, std::vector<T> out)
   return out;
 }
 
-/// Against sums one by one, with and without an addend, that of the result too.
+/// op(A) op(B) and C + op(A) op(B) against sums one by one.
+template <typename T>
+void CheckSums(const Instruction& i, const std::vector<T>& a, const std::vector<T>& b, const std::vector<T>& c, const std::vector<T>& plain,
+               const std::vector<T>& added) {
+  for (int32_t col = 0; col < i.cols; ++col) {
+    for (int32_t row = 0; row < i.rows; ++row) {
+      double sum = 0, size_of_terms = 0;
+      for (int32_t l = 0; l < i.inner; ++l) {
+        const double term = static_cast<double>(a[static_cast<size_t>(i.transpose_a ? l + row * i.a.ld : row + l * i.a.ld)]) *
+                            static_cast<double>(b[static_cast<size_t>(i.transpose_b ? col + l * i.b.ld : l + col * i.b.ld)]);
+        sum += term;
+        size_of_terms += std::fabs(term);
+      }
+      const size_t e = static_cast<size_t>(row + col * i.rows);
+      const double addend = static_cast<double>(c[e]);
+      const double tolerance = 4 * i.inner * std::numeric_limits<T>::epsilon() * (size_of_terms + std::fabs(addend));
+      ASSERT_NEAR(plain[e], sum, tolerance) << i.rows << " × " << i.cols << " × " << i.inner;
+      ASSERT_NEAR(added[e], sum + addend, tolerance) << i.rows << " × " << i.cols << " × " << i.inner;
+    }
+  }
+}
+
+/// With and without an addend, that of the result too.
 template <typename T>
 void CheckPanelProducts() {
   base::Rng rng(11);
@@ -53,22 +75,7 @@ void CheckPanelProducts() {
     at.c = at.out = in_place.data();
     SelectKernel<T>(i)(i, at);
     EXPECT_EQ(added, in_place);
-    for (int32_t col = 0; col < n; ++col) {
-      for (int32_t row = 0; row < m; ++row) {
-        double sum = 0, size_of_terms = 0;
-        for (int32_t l = 0; l < k; ++l) {
-          const double term = static_cast<double>(a[static_cast<size_t>(i.transpose_a ? l + row * k : row + l * m)]) *
-                              static_cast<double>(b[static_cast<size_t>(l + col * k)]);
-          sum += term;
-          size_of_terms += std::fabs(term);
-        }
-        const size_t e = static_cast<size_t>(row + col * m);
-        const double addend = static_cast<double>(c[e]);
-        const double tolerance = 4 * k * std::numeric_limits<T>::epsilon() * (size_of_terms + std::fabs(addend));
-        ASSERT_NEAR(plain[e], sum, tolerance) << m << " × " << n << " × " << k;
-        ASSERT_NEAR(added[e], sum + addend, tolerance) << m << " × " << n << " × " << k;
-      }
-    }
+    CheckSums(i, a, b, c, plain, added);
   }
 }
 
@@ -93,22 +100,7 @@ void CheckSmallProducts() {
     const std::vector<T> plain = RunKernel(i, at, c);
     i.op = Opcode::kMatMulAdd;
     const std::vector<T> added = RunKernel(i, at, std::vector<T>(c.size()));
-    for (int32_t col = 0; col < n; ++col) {
-      for (int32_t row = 0; row < m; ++row) {
-        double sum = 0, size_of_terms = 0;
-        for (int32_t l = 0; l < k; ++l) {
-          const double term = static_cast<double>(a[static_cast<size_t>(i.transpose_a ? l + row * i.a.ld : row + l * i.a.ld)]) *
-                              static_cast<double>(b[static_cast<size_t>(i.transpose_b ? col + l * i.b.ld : l + col * i.b.ld)]);
-          sum += term;
-          size_of_terms += std::fabs(term);
-        }
-        const size_t e = static_cast<size_t>(row + col * m);
-        const double addend = static_cast<double>(c[e]);
-        const double tolerance = 4 * k * std::numeric_limits<T>::epsilon() * (size_of_terms + std::fabs(addend));
-        ASSERT_NEAR(plain[e], sum, tolerance) << m << " × " << n << " × " << k;
-        ASSERT_NEAR(added[e], sum + addend, tolerance) << m << " × " << n << " × " << k;
-      }
-    }
+    CheckSums(i, a, b, c, plain, added);
   }
 }
 
@@ -137,6 +129,23 @@ void CheckElementwise() {
 
 TEST_P(KernelsTest, ElementwiseInFloat) { CheckElementwise<float>(); }
 TEST_P(KernelsTest, ElementwiseInDouble) { CheckElementwise<double>(); }
+
+/// In programs swish takes its sigmoid from another instruction; what comes is the same to the last bit.
+TEST_P(KernelsTest, SwishFromItsSigmoid) {
+  base::Rng rng(15);
+  for (int32_t count = 1; count < 40; ++count) {
+    const std::vector<float> z = Random<float>(count, &rng);
+    std::vector<float> sigmoid(z.size()), expected(z.size());
+    ApplyActivation(Activation::kSigmoid, 0, 0.0f, z.data(), sigmoid.data(), z.size());
+    const Places<float> at{.out = nullptr, .a = z.data(), .b = sigmoid.data(), .c = nullptr, .panel = nullptr};
+    for (int32_t order = 0; order <= kMaxDerivative; ++order) {
+      ApplyActivation(Activation::kSwish, order, 0.0f, z.data(), expected.data(), z.size());
+      EXPECT_EQ(RunKernel({.op = Opcode::kActivation, .rows = count, .cols = 1, .activation = Activation::kSwish, .order = order}, at,
+                          std::vector<float>(z.size())),
+                expected);
+    }
+  }
+}
 
 TEST(KernelsWithoutVectorsTest, SumsOfTilesOfAnySize) {
   base::Rng rng(13);
