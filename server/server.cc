@@ -103,7 +103,7 @@ class Server::Parts {
         io({.threads = options.io_threads, .max_queued = Queued()}),
         compute({.threads = ComputeThreads(options.compute_threads),
                  .max_queued = Queued(),
-                 .nice = 5}),
+                 .gives_way = true}),
         context{*store, models, io, compute, training, jobs, options, absl::Now()},
         sessions(*store, models),
         estimation(sessions, io) {

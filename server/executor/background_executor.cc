@@ -1,16 +1,14 @@
 #include "server/executor/background_executor.h"
 
-#include <sys/resource.h>
-#include <sys/syscall.h>
-#include <unistd.h>
-
 #include <utility>
+
+#include "server/executor/give_way.h"
 
 namespace metaekf::server {
 
 BackgroundExecutor::BackgroundExecutor(const Options& options) : max_queued_(options.max_queued) {
   for (size_t i = 0; i < options.threads; ++i) {
-    threads_.emplace_back([this, nice = options.nice] { Run(nice); });
+    threads_.emplace_back([this, gives_way = options.gives_way] { Run(gives_way); });
   }
 }
 
@@ -38,11 +36,8 @@ size_t BackgroundExecutor::queued() const {
   return queue_.size();
 }
 
-void BackgroundExecutor::Run(int nice) {
-  // On Linux the priority is the thread's own. Without it the thread works all the same.
-  if (nice != 0) {
-    (void)setpriority(PRIO_PROCESS, static_cast<id_t>(syscall(SYS_gettid)), nice);
-  }
+void BackgroundExecutor::Run(bool gives_way) {
+  if (gives_way) GiveWay();
   std::unique_lock lock(mutex_);
   while (true) {
     work_ready_.wait(lock, [this] { return stopping_ || !queue_.empty(); });

@@ -17,7 +17,7 @@ class BackgroundExecutor {
   struct Options {
     size_t threads = 1;
     size_t max_queued = 1024;
-    int nice = 0;  ///< priority of the threads; above 0 they give way to estimation
+    bool gives_way = false;  ///< threads GiveWay
   };
   explicit BackgroundExecutor(const Options& options);
   /// Runs what is queued, then ends.
@@ -28,7 +28,7 @@ class BackgroundExecutor {
   size_t queued() const;
 
  private:
-  void Run(int nice);
+  void Run(bool gives_way);
 
   const size_t max_queued_;
   mutable std::mutex mutex_;

@@ -4,7 +4,6 @@
 #include <signal.h>
 #include <spdlog/spdlog.h>
 #include <sys/prctl.h>
-#include <sys/resource.h>
 #include <unistd.h>
 
 #include <cerrno>
@@ -17,6 +16,7 @@
 #include "core/base/status.h"
 #include "core/meta/train.h"
 #include "core/nssm/model_file.h"
+#include "server/executor/give_way.h"
 #include "server/store/blob_store.h"
 #include "server/store/files.h"
 #include "server/training/dataset_file.h"
@@ -24,8 +24,6 @@
 
 namespace metaekf::server {
 namespace {
-
-constexpr int kNice = 10;
 
 volatile sig_atomic_t stop_requested = 0;
 
@@ -157,8 +155,7 @@ class Attempt {
 int RunWorker(const WorkerOptions& options) {
   if (!TieToServer(options.server)) return kWorkerStopped;
   StopOnSigterm();
-  // At the same priority it works as well, only less politely.
-  (void)setpriority(PRIO_PROCESS, 0, kNice);
+  GiveWay();
   ProgressReporter reporter;
   const absl::Status status = Attempt(options, reporter).Run();
   if (status.ok()) return kWorkerDone;
