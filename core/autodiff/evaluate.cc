@@ -3,12 +3,22 @@
 #include <algorithm>
 #include <new>
 
+#include "absl/container/inlined_vector.h"
 #include "core/autodiff/kernel.h"
+#include "core/linalg/packed_product.h"
 
 namespace metaekf::autodiff {
 namespace {
 
-constexpr std::align_val_t kAlignment{128};
+constexpr int64_t kArenaAlignment = 128;  // bytes
+constexpr std::align_val_t kAlignment{kArenaAlignment};
+
+template <typename T>
+std::vector<Step<T>> StepsOf(const std::vector<Instruction>& instructions) {
+  std::vector<Step<T>> steps;
+  for (const Instruction& i : instructions) steps.push_back(Memory<T>::StepOf(i, SelectKernel<T>(i)));
+  return steps;
+}
 
 template <typename T>
 std::vector<Kernel<T>> SelectKernels(const std::vector<Instruction>& instructions) {
@@ -45,6 +55,74 @@ void RunLoop(const Loop& loop, const std::vector<Kernel<T>>& kernels, const Memo
   }
 }
 
+template <typename T>
+void RunPacked(const Instruction& i, const Places<T>& at, const T* factor) {
+  const bool add = i.op == Opcode::kMatMulAdd;
+  if (add) CopyAddend(i, at);
+  linalg::PackedMatMul(i.rows, i.cols, i.inner, factor, at.b, i.b.ld, at.out, i.out.ld, add);
+}
+
+/// The products of several runs with one factor, as one.
+template <typename T>
+void RunPackedTogether(const Instruction& i, std::span<const Places<T>> runs, const T* factor, T* gathered) {
+  const int64_t columns = int64_t{i.cols} * static_cast<int64_t>(runs.size());
+  T* const results = gathered + columns * i.inner;
+  T* to = gathered;
+  for (const Places<T>& at : runs) {
+    for (int64_t j = 0; j < i.cols; ++j, to += i.inner) std::copy_n(at.b + j * i.b.ld, i.inner, to);
+  }
+  linalg::PackedMatMul(i.rows, static_cast<int32_t>(columns), i.inner, factor, gathered, i.inner, results, i.rows, false);
+  const T* from = results;
+  for (const Places<T>& at : runs) {
+    const bool add = i.op == Opcode::kMatMulAdd;
+    if (add) CopyAddend(i, at);
+    for (int64_t j = 0; j < i.cols; ++j, from += i.rows) {
+      T* const out = at.out + j * i.out.ld;
+      for (int32_t r = 0; r < i.rows; ++r) out[r] = add ? out[r] + from[r] : from[r];
+    }
+  }
+}
+
+template <typename T>
+const T* FactorOf(const Packed<T>* packed, size_t instruction) {
+  return packed == nullptr ? nullptr : (*packed)[instruction];
+}
+
+template <typename T>
+using Memories = absl::InlinedVector<Memory<T>, 8>;
+
+/// One product of every run.
+template <typename T>
+void RunProducts(const Step<T>& step, size_t k, const Memories<T>& memories, std::span<const Run<T>> runs, T* gathered) {
+  absl::InlinedVector<bool, 8> done(runs.size(), false);
+  for (size_t first = 0; first < runs.size(); ++first) {
+    if (done[first]) continue;
+    const T* const factor = FactorOf(runs[first].packed, k);
+    if (factor == nullptr) {
+      step.run(*step.instruction, memories[first].PlacesOf(step));
+      continue;
+    }
+    absl::InlinedVector<Places<T>, 8> sharing;
+    for (size_t run = first; run < runs.size(); ++run) {
+      if (FactorOf(runs[run].packed, k) != factor) continue;
+      sharing.push_back(memories[run].PlacesOf(step));
+      done[run] = true;
+    }
+    if (sharing.size() == 1) {
+      RunPacked(*step.instruction, sharing.front(), factor);
+    } else {
+      RunPackedTogether(*step.instruction, std::span<const Places<T>>(sharing), factor, gathered);
+    }
+  }
+}
+
+template <typename T>
+void RunStep(const Executable<T>& executable, const Step<T>& step, const Memory<T>& memory, const Arena<T>& arena) {
+  if (step.run != nullptr) return step.run(*step.instruction, memory.PlacesOf(step));
+  const size_t loop = static_cast<size_t>(step.instruction->loop);
+  RunLoop(executable.program().loops[loop], executable.loop_kernels()[loop], memory, arena.walks());
+}
+
 }  // namespace
 
 template <typename T>
@@ -59,7 +137,7 @@ AlignedBuffer<T>::AlignedBuffer(int64_t elements)
 
 template <typename T>
 Executable<T>::Executable(Program program)
-    : program_(std::move(program)), kernels_(SelectKernels<T>(program_.instructions)), constants_(program_.constants_size) {
+    : program_(std::move(program)), steps_(StepsOf<T>(program_.instructions)), constants_(program_.constants_size) {
   for (const Loop& loop : program_.loops) loop_kernels_.push_back(SelectKernels<T>(loop.instructions));
   for (const Program::ConstantBlock& block : program_.constants) {
     T* target = constants_.data() + block.offset;
@@ -72,28 +150,54 @@ Executable<T>::Executable(Program program)
 }
 
 template <typename T>
-Arena<T>::Arena(const std::vector<const Executable<T>*>& users)
-    : memory_((*std::max_element(users.begin(), users.end(), [](const Executable<T>* a, const Executable<T>* b) {
-                return a->program().arena_size < b->program().arena_size;
-              }))->program().arena_size) {
+Arena<T>::Arena(const std::vector<const Executable<T>*>& users, size_t runs) : size_(0), memory_(0), gathered_(0) {
+  int64_t gathered = 0;
   size_t walks = 0;
   for (const Executable<T>* user : users) {
-    for (const Loop& loop : user->program().loops) walks = std::max(walks, loop.instructions.size());
+    const Program& program = user->program();
+    size_ = std::max(size_, program.arena_size);
+    for (const Loop& loop : program.loops) walks = std::max(walks, loop.instructions.size());
+    for (const Instruction& i : program.instructions) {
+      if (i.op == Opcode::kMatMul || i.op == Opcode::kMatMulAdd) gathered = std::max(gathered, (int64_t{i.inner} + i.rows) * i.cols);
+    }
   }
+  constexpr int64_t kAligned = kArenaAlignment / static_cast<int64_t>(sizeof(T));
+  size_ = (size_ + kAligned - 1) / kAligned * kAligned;
+  memory_ = AlignedBuffer<T>(size_ * static_cast<int64_t>(runs));
+  if (runs > 1) gathered_ = AlignedBuffer<T>(gathered * static_cast<int64_t>(runs));
   walks_.resize(walks);
 }
 
 template <typename T>
-void Evaluate(const Executable<T>& executable, const Slots<T>& slots, const Arena<T>& arena) {
-  const Program& program = executable.program();
+void Evaluate(const Executable<T>& executable, const Slots<T>& slots, const Arena<T>& arena, const Packed<T>* packed) {
   const Memory<T> memory(arena.data(), executable.constants(), slots);
-  for (size_t k = 0; k < program.instructions.size(); ++k) {
-    const Instruction& i = program.instructions[k];
-    if (i.op == Opcode::kLoop) {
-      const size_t loop = static_cast<size_t>(i.loop);
-      RunLoop(program.loops[loop], executable.loop_kernels()[loop], memory, arena.walks());
+  if (packed == nullptr) {
+    for (const Step<T>& step : executable.steps()) RunStep(executable, step, memory, arena);
+    return;
+  }
+  const T* const* factor = packed->data();
+  for (const Step<T>& step : executable.steps()) {
+    if (*factor != nullptr) {
+      RunPacked(*step.instruction, memory.PlacesOf(step), *factor);
     } else {
-      executable.kernels()[k](i, memory.PlacesOf(i));
+      RunStep(executable, step, memory, arena);
+    }
+    ++factor;
+  }
+}
+
+template <typename T>
+void EvaluateTogether(const Executable<T>& executable, std::span<const Run<T>> runs, const Arena<T>& arena) {
+  if (runs.size() == 1) return Evaluate(executable, runs[0].slots, arena, runs[0].packed);
+  Memories<T> memories;
+  for (size_t run = 0; run < runs.size(); ++run) memories.emplace_back(arena.data(run), executable.constants(), runs[run].slots);
+  for (size_t k = 0; k < executable.steps().size(); ++k) {
+    const Step<T>& step = executable.steps()[k];
+    const Opcode op = step.instruction->op;
+    if (op == Opcode::kMatMul || op == Opcode::kMatMulAdd) {
+      RunProducts(step, k, memories, runs, arena.gathered());
+    } else {
+      for (const Memory<T>& memory : memories) RunStep(executable, step, memory, arena);
     }
   }
 }
@@ -104,7 +208,9 @@ template class Executable<float>;
 template class Executable<double>;
 template class Arena<float>;
 template class Arena<double>;
-template void Evaluate(const Executable<float>&, const Slots<float>&, const Arena<float>&);
-template void Evaluate(const Executable<double>&, const Slots<double>&, const Arena<double>&);
+template void Evaluate(const Executable<float>&, const Slots<float>&, const Arena<float>&, const Packed<float>*);
+template void Evaluate(const Executable<double>&, const Slots<double>&, const Arena<double>&, const Packed<double>*);
+template void EvaluateTogether(const Executable<float>&, std::span<const Run<float>>, const Arena<float>&);
+template void EvaluateTogether(const Executable<double>&, std::span<const Run<double>>, const Arena<double>&);
 
 }  // namespace metaekf::autodiff

@@ -3,6 +3,7 @@
 #include <array>
 #include <cstddef>
 #include <memory>
+#include <span>
 #include <vector>
 
 #include "core/autodiff/program.h"
@@ -42,6 +43,18 @@ struct Walk {
 template <typename T>
 using Kernel = void (*)(const Instruction& i, const Places<T>& at);
 
+/// An instruction with what it takes to run it, close together: small programs spend their time on finding their way.
+template <typename T>
+struct Step {
+  struct Operand {
+    int64_t base;    ///< index of its memory (Memory)
+    int64_t offset;  ///< elements
+  };
+  Kernel<T> run;  ///< null for a loop
+  const Instruction* instruction;
+  Operand out, a, b, c;
+};
+
 /// A program with its constants in place and a kernel for each instruction: what runs. Never changes, so threads may share it.
 template <typename T>
 class Executable {
@@ -49,13 +62,13 @@ class Executable {
   explicit Executable(Program program);
 
   const Program& program() const { return program_; }
-  const std::vector<Kernel<T>>& kernels() const { return kernels_; }
+  const std::vector<Step<T>>& steps() const { return steps_; }
   const std::vector<std::vector<Kernel<T>>>& loop_kernels() const { return loop_kernels_; }
   const T* constants() const { return constants_.data(); }
 
  private:
   Program program_;
-  std::vector<Kernel<T>> kernels_;
+  std::vector<Step<T>> steps_;
   std::vector<std::vector<Kernel<T>>> loop_kernels_;
   AlignedBuffer<T> constants_;
 };
@@ -64,13 +77,17 @@ class Executable {
 template <typename T>
 class Arena {
  public:
-  explicit Arena(const std::vector<const Executable<T>*>& users);
-  T* data() const { return memory_.data(); }
+  /// @param runs  of an executable side by side, at most.
+  explicit Arena(const std::vector<const Executable<T>*>& users, size_t runs = 1);
+  T* data(size_t run = 0) const { return memory_.data() + static_cast<int64_t>(run) * size_; }
   /// One for each instruction of a loop.
   Walk<T>* walks() const { return walks_.data(); }
+  /// Where there are several runs, for second factors and results of a product of all of them.
+  T* gathered() const { return gathered_.data(); }
 
  private:
-  AlignedBuffer<T> memory_;
+  int64_t size_;  // of each run
+  AlignedBuffer<T> memory_, gathered_;
   mutable std::vector<Walk<T>> walks_;
 };
 
@@ -91,8 +108,25 @@ class Slots {
   std::array<T*, kMaxSlots> pointers_{};
 };
 
-/// Runs a program on the CPU, in the calling thread, without allocating.
+/// For each instruction of an executable its first factor as linalg::Pack lays it out, or null: it is read where it lies.
 template <typename T>
-void Evaluate(const Executable<T>& executable, const Slots<T>& slots, const Arena<T>& arena);
+using Packed = std::vector<const T*>;
+
+/// Runs a program on the CPU, in the calling thread, without allocating.
+/// @param packed  or null: nothing is packed.
+template <typename T>
+void Evaluate(const Executable<T>& executable, const Slots<T>& slots, const Arena<T>& arena, const Packed<T>* packed = nullptr);
+
+template <typename T>
+struct Run {
+  Slots<T> slots;
+  const Packed<T>* packed;
+};
+
+/// Several runs of a program, instruction by instruction, so that packed factors that they share are read once. Each does to the bit what it
+/// does alone. Without allocating.
+/// @param runs  as many as the arena has at most.
+template <typename T>
+void EvaluateTogether(const Executable<T>& executable, std::span<const Run<T>> runs, const Arena<T>& arena);
 
 }  // namespace metaekf::autodiff

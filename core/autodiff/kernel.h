@@ -19,6 +19,17 @@ class Memory {
     std::copy_n(slots.data(), Slots<T>::kMaxSlots, bases_.begin() + kBefore);
   }
 
+  static Step<T> StepOf(const Instruction& i, Kernel<T> kernel) {
+    const auto operand = [](const Operand& o) { return typename Step<T>::Operand{int64_t{kBefore} + o.slot, o.offset}; };
+    return {kernel, &i, operand(i.out), operand(i.a), operand(i.b), operand(i.c)};
+  }
+
+  Places<T> PlacesOf(const Step<T>& step) const {
+    const auto at = [this](const typename Step<T>::Operand& o) { return bases_[static_cast<size_t>(o.base)] + o.offset; };
+    return {.out = at(step.out), .a = at(step.a), .b = at(step.b), .c = at(step.c), .panel = nullptr};
+  }
+
+  /// Of an instruction in a loop.
   Places<T> PlacesOf(const Instruction& i) const {
     return {.out = At(i.out), .a = At(i.a), .b = At(i.b), .c = At(i.c), .panel = bases_[kBefore + Operand::kArena] + std::max<int64_t>(i.panel, 0)};
   }
@@ -40,6 +51,10 @@ Kernel<T> SelectVectorKernel(const Instruction& i);
 /// Of an activation.
 template <typename T>
 Kernel<T> SelectActivationKernel(Activation activation, int order);
+
+/// out ← C of a kMatMulAdd.
+template <typename T>
+void CopyAddend(const Instruction& i, const Places<T>& at);
 
 /// Elements of the panel of a product: op(A), column by column, each with zeros below it up to whole vectors.
 int64_t PanelSize(int32_t rows, int32_t inner);

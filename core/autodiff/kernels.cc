@@ -153,6 +153,13 @@ void SliceRows(const Instruction& i, const Places<T>& at) {
 }  // namespace
 
 template <typename T>
+void CopyAddend(const Instruction& i, const Places<T>& at) {
+  CopyOperand(i, i.c, at.c, at.out);
+}
+template void CopyAddend(const Instruction&, const Places<float>&);
+template void CopyAddend(const Instruction&, const Places<double>&);
+
+template <typename T>
 Kernel<T> SelectKernel(const Instruction& i) {
   if (const Kernel<T> kernel = SelectVectorKernel<T>(i)) return kernel;
   switch (i.op) {

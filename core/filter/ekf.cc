@@ -3,6 +3,7 @@
 #include <cmath>
 #include <limits>
 
+#include "absl/container/inlined_vector.h"
 #include "core/base/numbers.h"
 #include "core/base/status.h"
 #include "core/filter/chi_squared.h"
@@ -183,10 +184,45 @@ Estimate Ekf::MakeEstimate() const {
 
 absl::Status Ekf::Step(const Ref<const VectorXd>& input, const Ref<const VectorXd>& output,
                        FilterModel::Scratch* scratch, Estimate* estimate, const MatrixXd* measurement_cov) {
-  if (input.size() != input_size_ || output.size() != output_size_) {
-    return absl::InvalidArgumentError(absl::StrCat("a sample has ", input_size_, " inputs and ", output_size_,
-                                                   " outputs, got ", input.size(), " and ", output.size()));
+  METAEKF_RETURN_IF_ERROR(CheckSizes(input.size(), output.size()));
+  NextSample sample{this, input.data(), output.data(), measurement_cov, estimate, absl::OkStatus()};
+  StepTogether({&sample, 1}, scratch);
+  return sample.status;
+}
+
+absl::Status Ekf::CheckSizes(Index inputs, Index outputs) const {
+  if (inputs == input_size_ && outputs == output_size_) return absl::OkStatus();
+  return absl::InvalidArgumentError(absl::StrCat("a sample has ", input_size_, " inputs and ", output_size_, " outputs, got ", inputs, " and ", outputs));
+}
+
+void StepTogether(std::span<NextSample> samples, FilterModel::Scratch* scratch) {
+  absl::InlinedVector<JointModel::Point, 8> points;
+  for (NextSample& sample : samples) {
+    sample.status = sample.filter->Begin(sample, scratch);
+    if (sample.status.ok() && sample.filter->passes_time()) points.push_back(sample.filter->TransitionPoint());
   }
+  JointModel::Transition(points, scratch);
+  points.clear();
+  for (NextSample& sample : samples) {
+    if (!sample.status.ok()) continue;
+    if (sample.filter->passes_time()) sample.filter->TimeUpdate();
+    if (sample.filter->measures()) points.push_back(sample.filter->MeasurementPoint());
+  }
+  JointModel::Measurement(points, scratch);
+  points.clear();
+  for (NextSample& sample : samples) {
+    if (!sample.status.ok()) continue;
+    sample.filter->MeasurementUpdate(scratch, sample.estimate);
+    if (sample.filter->describes_outputs()) points.push_back(sample.filter->MeasurementPoint());
+  }
+  JointModel::Measurement(points, scratch);
+  for (NextSample& sample : samples) {
+    if (sample.status.ok()) sample.filter->Finish(sample.estimate);
+  }
+}
+
+absl::Status Ekf::Begin(const NextSample& sample, FilterModel::Scratch* scratch) {
+  const Eigen::Map<const VectorXd> input(sample.input, input_size_), output(sample.output, output_size_);
   for (Index i = 0; i < input_size_; ++i) {
     if (!std::isfinite(input[i])) {
       return absl::InvalidArgumentError(absl::StrCat("input ", i + 1, " is ", base::FormatExact(input[i])));
@@ -197,39 +233,62 @@ absl::Status Ekf::Step(const Ref<const VectorXd>& input, const Ref<const VectorX
       return absl::InvalidArgumentError(absl::StrCat("output ", i + 1, " is ", base::FormatExact(output[i])));
     }
   }
-  std::optional<MatrixXd> R;
-  if (measurement_cov != nullptr) {
-    METAEKF_ASSIGN_OR_RETURN(R, NormalisedNoise(*measurement_cov, normaliser_.outputs.scale));
+  sample_cov_.reset();
+  if (sample.measurement_cov != nullptr) {
+    METAEKF_ASSIGN_OR_RETURN(sample_cov_, NormalisedNoise(*sample.measurement_cov, normaliser_.outputs.scale));
   }
-  estimate->reset = state_.diverged && restart_after_divergence_;
-  if (estimate->reset) Restart();
+  sample.estimate->reset = state_.diverged && restart_after_divergence_;
+  if (sample.estimate->reset) Restart();
   u_ = (input - normaliser_.inputs.mean).cwiseQuotient(normaliser_.inputs.scale);
   y_ = (output - normaliser_.outputs.mean).cwiseQuotient(normaliser_.outputs.scale);
   if (trace_ != nullptr) *trace_ = {};
+  passes_time_ = state_.started && !warming_up();
   if (warming_up()) {
     FillWindow(scratch);
     // The window's last sample is the first with a latent; its measurement has been used by the encoder.
     y_.setConstant(kNaN);
-  } else if (state_.started) {
-    TimeUpdate(scratch);
   }
+  measured_.clear();
+  for (Index i = 0; i < output_size_; ++i) {
+    if (!std::isnan(y_[i])) measured_.push_back(i);
+  }
+  return absl::OkStatus();
+}
+
+void Ekf::TimeUpdate() {
+  FactorTimeUpdate(F_, process_factor_, &time_work_, &state_.factor);
+  state_.mean = value_;
+  if (trace_ == nullptr) return;
+  trace_->linked = true;
+  trace_->prior = value_;
+  trace_->F = F_;
+}
+
+void Ekf::MeasurementUpdate(FilterModel::Scratch* scratch, Estimate* estimate) {
   state_.started = true;
   ++state_.samples;
   state_.last_input = u_;
-  MeasurementUpdate(R ? *R : measurement_cov_, scratch, estimate);
+  estimate->innovation.setConstant(kNaN);
+  estimate->innovation_cov.setConstant(kNaN);
+  estimate->nis = kNaN;
+  estimate->gated = 0;
+  estimate->measured = static_cast<int>(measured_.size());
+  if (!measured_.empty()) Update(sample_cov_ ? *sample_cov_ : measurement_cov_, estimate);
   PutInside(scratch, estimate);
+}
+
+void Ekf::Finish(Estimate* estimate) {
   if (warming_up()) {
     estimate->mean.setConstant(kNaN);
     estimate->cov.setConstant(kNaN);
   } else {
-    Describe(state_.mean, state_.factor, u_, scratch, estimate);
+    WriteEstimate(state_.mean, state_.factor, estimate);
   }
   if (trace_ != nullptr) {
     trace_->input = u_;
     trace_->warming_up = warming_up();
   }
   JudgeHealth(estimate);
-  return absl::OkStatus();
 }
 
 void Ekf::Restart() {
@@ -287,29 +346,8 @@ void Ekf::BeginFromWindow(FilterModel::Scratch* scratch) {
   state_.factor = std::move(start.factor);
 }
 
-void Ekf::TimeUpdate(FilterModel::Scratch* scratch) {
-  joint_.Transition(state_.mean, next_input_ ? u_ : state_.last_input, &value_, &F_, scratch);
-  FactorTimeUpdate(F_, process_factor_, &time_work_, &state_.factor);
-  state_.mean = value_;
-  if (trace_ == nullptr) return;
-  trace_->linked = true;
-  trace_->prior = value_;
-  trace_->F = F_;
-}
-
-void Ekf::MeasurementUpdate(const MatrixXd& R, FilterModel::Scratch* scratch, Estimate* estimate) {
-  estimate->innovation.setConstant(kNaN);
-  estimate->innovation_cov.setConstant(kNaN);
-  estimate->nis = kNaN;
-  estimate->gated = 0;
-  measured_.clear();
-  for (Index i = 0; i < output_size_; ++i) {
-    if (!std::isnan(y_[i])) measured_.push_back(i);
-  }
-  estimate->measured = static_cast<int>(measured_.size());
-  if (measured_.empty()) return;
-
-  joint_.Measurement(state_.mean, u_, &h_, &H_, scratch);
+/// x⁻ to x⁺ by what was measured, from h and H there.
+void Ekf::Update(const MatrixXd& R, Estimate* estimate) {
   prior_factor_ = state_.factor;
   estimate->nis = UpdateFactor(measured_, R);
   WriteInnovation(estimate);
@@ -394,10 +432,15 @@ void Ekf::LeaveOutliersOut(const MatrixXd& R, Estimate* estimate) {
 
 void Ekf::Describe(const VectorXd& mean, const MatrixXd& factor, const VectorXd& input, FilterModel::Scratch* scratch,
                    Estimate* estimate) {
+  if (case_one_) joint_.Measurement(mean, input, &h_, &H_, scratch);
+  WriteEstimate(mean, factor, estimate);
+}
+
+/// In Case I from h and H at the mean.
+void Ekf::WriteEstimate(const VectorXd& mean, const MatrixXd& factor, Estimate* estimate) {
   const data::ChannelScaling& scaling = case_one_ ? normaliser_.outputs : normaliser_.states;
   auto root = product_.topRows(estimate_size());
   if (case_one_) {
-    joint_.Measurement(mean, input, &h_, &H_, scratch);
     estimate->mean = h_.cwiseProduct(scaling.scale) + scaling.mean;
     root.noalias() = H_.lazyProduct(factor);
   } else {

@@ -3,6 +3,7 @@
 #include <limits>
 #include <memory>
 #include <optional>
+#include <span>
 #include <vector>
 
 #include "absl/status/statusor.h"
@@ -73,6 +74,23 @@ struct StepTrace {
   bool warming_up = false;       ///< Case I: there is no state yet
 };
 
+/// The next sample of one of several filters, and what it teaches.
+template <class Filter>
+struct NextSampleOf {
+  Filter* filter = nullptr;
+  const double* input = nullptr;                     ///< n_u
+  const double* output = nullptr;                    ///< n_y
+  const Eigen::MatrixXd* measurement_cov = nullptr;  ///< or null: the filter's
+  Estimate* estimate = nullptr;
+  absl::Status status;  ///< of the step
+};
+
+class Ekf;
+using NextSample = NextSampleOf<Ekf>;
+
+/// Ekf::Step of filters on one FilterModel, which reads weights that they share once. What a filter does is to the bit what it does alone.
+void StepTogether(std::span<NextSample> samples, FilterModel::Scratch* scratch);
+
 /// An extended Kalman filter on a neural state-space model, one sample at a time.
 ///
 ///   x⁻ = f(x⁺, u_{t−1})      P⁻ = F P⁺ Fᵀ + Q          from the second sample on
@@ -131,6 +149,8 @@ class Ekf {
   /// @param inputs  n_u × horizon, finite. @return one estimate per column. Errors as those of Step.
   absl::StatusOr<std::vector<Estimate>> Forecast(const Eigen::MatrixXd& inputs, FilterModel::Scratch* scratch) const;
 
+  /// Errors: InvalidArgument if a sample's sizes are not n_u and n_y.
+  absl::Status CheckSizes(Eigen::Index inputs, Eigen::Index outputs) const;
   int32_t estimate_size() const { return case_one_ ? output_size_ : model_size_; }
   const Eigen::MatrixXd& process_factor() const { return process_factor_; }
   bool projects() const { return projection_ != Projection::kNone; }
@@ -142,12 +162,24 @@ class Ekf {
   bool constrained() const { return normalised_set_.has_value(); }
 
  private:
+  friend void StepTogether(std::span<NextSample> samples, FilterModel::Scratch* scratch);
   Ekf() = default;
+
+  // The parts of a step, between which a function of the model is evaluated.
+  absl::Status Begin(const NextSample& sample, FilterModel::Scratch* scratch);
+  bool passes_time() const { return passes_time_; }
+  JointModel::Point TransitionPoint() { return {&joint_, &state_.mean, next_input_ ? &u_ : &state_.last_input, &value_, &F_}; }
+  void TimeUpdate();
+  bool measures() const { return !measured_.empty(); }
+  JointModel::Point MeasurementPoint() { return {&joint_, &state_.mean, &u_, &h_, &H_}; }
+  void MeasurementUpdate(FilterModel::Scratch* scratch, Estimate* estimate);
+  bool describes_outputs() const { return case_one_ && !warming_up(); }
+  void Finish(Estimate* estimate);
 
   void FillWindow(FilterModel::Scratch* scratch);  // adds (u_, y_), begins when full
   void BeginFromWindow(FilterModel::Scratch* scratch);
-  void TimeUpdate(FilterModel::Scratch* scratch);
-  void MeasurementUpdate(const Eigen::MatrixXd& R, FilterModel::Scratch* scratch, Estimate* estimate);
+  void Update(const Eigen::MatrixXd& R, Estimate* estimate);
+  void WriteEstimate(const Eigen::VectorXd& mean, const Eigen::MatrixXd& factor, Estimate* estimate);
   // L⁻ to L⁺ by some components of y; leaves S^½ and K S^½ in update_work_ and S^−½ ỹ in whitened_. Returns their NIS.
   double UpdateFactor(const std::vector<Eigen::Index>& rows, const Eigen::MatrixXd& R);
   void MoveMean();
@@ -179,6 +211,8 @@ class Ekf {
   FilterState state_;
   StepTrace* trace_ = nullptr;
   // Scratch of a step, sized once.
+  bool passes_time_ = false;
+  std::optional<Eigen::MatrixXd> sample_cov_;  // R of the sample, normalised, where it brings one
   Eigen::VectorXd u_, y_, value_, latent_, h_, whitened_;
   std::vector<Eigen::Index> measured_;  // components of y, those that are
   Eigen::Index updated_ = 0;            // components in the last UpdateFactor

@@ -1,9 +1,12 @@
 #include "core/filter/filter_model.h"
 
 #include <algorithm>
+#include <array>
 
+#include "absl/container/inlined_vector.h"
 #include "core/autodiff/differentiate.h"
 #include "core/autodiff/evaluate.h"
+#include "core/autodiff/packed_weights.h"
 #include "core/filter/unknown_directions.h"
 #include "core/nssm/start_fit.h"
 
@@ -19,12 +22,17 @@ using autodiff::Value;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
+constexpr size_t kMostTogether = 8;  // points: with more, columns are no longer few
+constexpr int64_t kLarge = 1 << 15;  // parameters, which no longer stay in the first cache
+
 enum Slot : int32_t { kParameters, kState, kInput, kDirection, kValueOut, kJacobianOut };
 
-/// A function of state and input: its value with the Jacobian by the state, and its derivative along one direction of the parameters.
+enum Function : size_t { kTransition, kMeasurement, kReconstruction, kFunctions };
+
+/// Of each function of state and input its value with the Jacobian by the state, and its derivative along one direction of the parameters.
 struct Programs {
-  autodiff::Program transition, measurement, reconstruction, encode;
-  autodiff::Program transition_along, measurement_along, reconstruction_along;
+  std::array<autodiff::Program, kFunctions> with_jacobian, along;
+  autodiff::Program encode;
 };
 
 /// value(x, u) and its derivative along every component of x at once.
@@ -39,7 +47,8 @@ autodiff::Program WithJacobian(Graph* graph, Value value, Value state) {
 
 Programs BuildPrograms(const nssm::Model& model, int32_t n) {
   const nssm::ModelSpec& spec = model.spec();
-  const auto build = [&](const auto& function, autodiff::Program* with_jacobian, autodiff::Program* along) {
+  Programs programs;
+  const auto build = [&](Function which, const auto& function) {
     for (const bool by_parameters : {false, true}) {
       Graph graph;
       const nn::ParameterValues parameters = nn::BindParameters(model.layout(), kParameters, &graph);
@@ -47,7 +56,7 @@ Programs BuildPrograms(const nssm::Model& model, int32_t n) {
       const Value state = graph.Input(kState, 0, n, 1);
       const Value value = function(parts, state, spec.input_size > 0 ? graph.Input(kInput, 0, spec.input_size, 1) : kNoValue);
       if (!by_parameters) {
-        *with_jacobian = WithJacobian(&graph, value, state);
+        programs.with_jacobian[which] = WithJacobian(&graph, value, state);
         continue;
       }
       const nn::ParameterValues direction = nn::BindParameters(model.layout(), kDirection, &graph);
@@ -55,20 +64,18 @@ Programs BuildPrograms(const nssm::Model& model, int32_t n) {
       for (size_t i = 0; i < parameters.size(); ++i) seeds.push_back({parameters[i], direction[i]});
       Value tangent = autodiff::Jvp(&graph, seeds, {value})[0];
       if (tangent == kNoValue) tangent = graph.Constant(0, graph.node(value).rows, 1);
-      *along = autodiff::Compile(graph, {{tangent, kValueOut}});
+      programs.along[which] = autodiff::Compile(graph, {{tangent, kValueOut}});
     }
   };
   using Parts = nssm::ModelGraph;
-  Programs programs;
-  build([&](const Parts& parts, Value state, Value input) {
+  build(kTransition, [&](const Parts& parts, Value state, Value input) {
     return spec.is_case_one() ? parts.Advance(state, input) : parts.State(parts.Advance(parts.Encode(state, input), input));
-  }, &programs.transition, &programs.transition_along);
-  build([&](const Parts& parts, Value state, Value input) {
+  });
+  build(kMeasurement, [&](const Parts& parts, Value state, Value input) {
     return spec.is_case_one() ? parts.Output(state, kNoValue) : parts.Output(parts.Encode(state, input), state);
-  }, &programs.measurement, &programs.measurement_along);
+  });
   if (!spec.is_case_one()) {
-    build([&](const Parts& parts, Value state, Value input) { return parts.State(parts.Encode(state, input)); },
-          &programs.reconstruction, &programs.reconstruction_along);
+    build(kReconstruction, [&](const Parts& parts, Value state, Value input) { return parts.State(parts.Encode(state, input)); });
   }
   if (spec.is_case_one() && !spec.fits_start()) {
     Graph graph;
@@ -79,18 +86,21 @@ Programs BuildPrograms(const nssm::Model& model, int32_t n) {
   return programs;
 }
 
+FilterModel::Point PointOf(const FilterModel::Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u,
+                           VectorXd* value, MatrixXd* jacobian) {
+  return {&parameters, {x.data(), x.size()}, {u.data(), u.size()}, value, jacobian};
+}
+
 template <typename T>
 class TypedFilterModel : public FilterModel {
  public:
   TypedFilterModel(Programs programs, const nssm::Bundle& bundle, int32_t state_size)
       : model_(bundle.model),
-        transition_(std::move(programs.transition)),
-        measurement_(std::move(programs.measurement)),
-        reconstruction_(std::move(programs.reconstruction)),
+        with_jacobian_{Executable<T>(std::move(programs.with_jacobian[kTransition])), Executable<T>(std::move(programs.with_jacobian[kMeasurement])),
+                       Executable<T>(std::move(programs.with_jacobian[kReconstruction]))},
+        along_{Executable<T>(std::move(programs.along[kTransition])), Executable<T>(std::move(programs.along[kMeasurement])),
+               Executable<T>(std::move(programs.along[kReconstruction]))},
         encode_(std::move(programs.encode)),
-        transition_along_(std::move(programs.transition_along)),
-        measurement_along_(std::move(programs.measurement_along)),
-        reconstruction_along_(std::move(programs.reconstruction_along)),
         argument_size_(std::max<int64_t>(state_size, model_.start_size())),
         input_size_(model_.spec().input_size),
         value_size_(std::max(state_size, model_.spec().output_size)) {
@@ -98,35 +108,48 @@ class TypedFilterModel : public FilterModel {
     if (model_.spec().fits_start()) prior_ = bundle.prior;
   }
 
-  std::unique_ptr<Parameters> Prepare(const std::vector<double>& parameters, const MatrixXd& directions) const override {
+  std::unique_ptr<Parameters> Prepare(const std::vector<double>& parameters, const MatrixXd& directions, const Parameters* base) const override {
     auto typed = std::make_unique<TypedParameters>(directions);
     typed->values.assign(parameters.begin(), parameters.end());
     if (prior_) typed->exact = parameters;
+    const auto* const other = static_cast<const TypedParameters*>(base);
+    typed->packed.emplace(std::initializer_list<const Executable<T>*>{&with_jacobian_[kTransition], &with_jacobian_[kMeasurement], &with_jacobian_[kReconstruction]},
+                          kParameters, typed->values.data(), other == nullptr ? nullptr : &*other->packed);
+    std::vector<bool> unknown(typed->values.size(), false);
+    for (Eigen::Index i = 0; i < directions.rows(); ++i) unknown[static_cast<size_t>(i)] = (directions.row(i).array() != 0).any();
+    for (size_t function = 0; function < kFunctions; ++function) typed->known[function] = typed->packed->Without(function, unknown);
     return typed;
   }
 
   std::unique_ptr<Scratch> MakeScratch() const override { return std::make_unique<TypedScratch>(*this); }
+  bool is_large() const override { return model_.layout().size() >= kLarge; }
 
-  void Transition(const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u, VectorXd* f, MatrixXd* F,
-                  Scratch* scratch) const override {
-    Run(transition_, transition_along_, state_size_, parameters, x, u, f, F, scratch);
+  using FilterModel::Measurement;
+  using FilterModel::Transition;
+  void Transition(std::span<const Point> points, Scratch* scratch) const override { Run(kTransition, state_size_, points, scratch); }
+  void Measurement(std::span<const Point> points, Scratch* scratch) const override {
+    Run(kMeasurement, model_.spec().output_size, points, scratch);
   }
-
-  void Measurement(const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u, VectorXd* h, MatrixXd* H,
-                   Scratch* scratch) const override {
-    Run(measurement_, measurement_along_, model_.spec().output_size, parameters, x, u, h, H, scratch);
-  }
-
   void Reconstruct(const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u,
                    VectorXd* reconstruction, MatrixXd* J, Scratch* scratch) const override {
-    Run(reconstruction_, reconstruction_along_, state_size_, parameters, x, u, reconstruction, J, scratch);
+    const Point point = PointOf(parameters, x, u, reconstruction, J);
+    Run(kReconstruction, state_size_, {&point, 1}, scratch);
   }
 
   void Encode(const Parameters& parameters, const Eigen::Ref<const VectorXd>& window, VectorXd* latent, Scratch* scratch) const override {
-    if (!prior_) return Run(encode_, encode_, latent->size(), parameters, window, VectorXd(), latent, nullptr, scratch);
     TypedScratch& s = static_cast<TypedScratch&>(*scratch);
-    s.window = window;
-    *latent = s.start_fit->Fit(static_cast<const TypedParameters&>(parameters).exact.data(), s.window).col(0);
+    const TypedParameters& typed = static_cast<const TypedParameters&>(parameters);
+    if (prior_) {
+      s.window = window;
+      *latent = s.start_fit->Fit(typed.exact.data(), s.window).col(0);
+      return;
+    }
+    Lane& lane = s.lanes.front();
+    lane.argument.head(window.size()) = window.template cast<T>();
+    Slots<T> slots;
+    slots.Input(kParameters, typed.values.data()).Input(kState, lane.argument.data()).Output(kValueOut, lane.value.data());
+    autodiff::Evaluate(encode_, slots, s.arena);
+    *latent = lane.value.head(latent->size()).template cast<double>();
   }
 
   MatrixXd EncodedCovariance(const Scratch& scratch) const override {
@@ -134,76 +157,116 @@ class TypedFilterModel : public FilterModel {
   }
 
  private:
+  using Vector = Eigen::Matrix<T, Eigen::Dynamic, 1>;
+  using Matrix = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic>;
+  using Factors = autodiff::Packed<T>;
+
   struct TypedParameters : Parameters {
     explicit TypedParameters(const MatrixXd& unknown) : along(unknown.template cast<T>()) { directions_ = unknown.cols(); }
     std::vector<T> values;
-    Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic> along;  // V
+    Matrix along;  // V
+    std::optional<autodiff::PackedWeights<T>> packed;
+    std::array<Factors, kFunctions> known;  // of weights that V leaves alone
     std::vector<double> exact;  // for StartFit
   };
+  /// What a point is evaluated with.
+  struct Lane {
+    explicit Lane(const TypedFilterModel& owner) : argument(owner.argument_size_), input(owner.input_size_), value(owner.value_size_),
+                                                   jacobian(int64_t{owner.value_size_} * owner.state_size_) {}
+    Vector parameters;  // ω̂ + V z
+    Vector argument, input, value, jacobian;
+  };
   struct TypedScratch : Scratch {
-    explicit TypedScratch(const TypedFilterModel& owner)
-        : arena({&owner.transition_, &owner.measurement_, &owner.reconstruction_, &owner.encode_, &owner.transition_along_,
-                 &owner.measurement_along_, &owner.reconstruction_along_}),
-          parameters(owner.model_.layout().size()),
-          state(static_cast<size_t>(owner.argument_size_)),
-          input(static_cast<size_t>(owner.input_size_)),
-          value(static_cast<size_t>(owner.value_size_)),
-          jacobian(static_cast<size_t>(owner.value_size_) * static_cast<size_t>(owner.state_size_)) {
+    explicit TypedScratch(const TypedFilterModel& owner) : arena(owner.Executables(), owner.lanes()), lanes(owner.lanes(), Lane(owner)) {
+      lanes.front().parameters.resize(owner.model_.layout().size());
       if (!owner.prior_) return;
       start_fit.emplace(owner.model_, *owner.prior_, 1);
       window.resize(owner.model_.start_size(), 1);
     }
     Arena<T> arena;
-    Eigen::Matrix<T, Eigen::Dynamic, 1> parameters;  // ω̂ + V z
-    std::vector<T> state, input, value, jacobian;
+    std::vector<Lane> lanes;
     std::optional<nssm::StartFit> start_fit;
     MatrixXd window;
   };
 
-  /// Value and Jacobian, the latter by z too where the state comes with it. @param rows  of the program's results: the first of these.
-  void Run(const Executable<T>& executable, const Executable<T>& along, Eigen::Index rows, const Parameters& parameters, const Eigen::Ref<const VectorXd>& x,
-           const Eigen::Ref<const VectorXd>& u, VectorXd* value, MatrixXd* jacobian, Scratch* scratch) const {
+  size_t lanes() const { return is_large() ? kMostTogether : 1; }
+
+  std::vector<const Executable<T>*> Executables() const {
+    std::vector<const Executable<T>*> all{&encode_};
+    for (const Executable<T>& executable : with_jacobian_) all.push_back(&executable);
+    for (const Executable<T>& executable : along_) all.push_back(&executable);
+    return all;
+  }
+
+  /// @param rows  of the function's value.
+  void Run(Function function, Eigen::Index rows, std::span<const Point> points, Scratch* scratch) const {
     TypedScratch& s = static_cast<TypedScratch&>(*scratch);
-    const TypedParameters& typed = static_cast<const TypedParameters&>(parameters);
-    const Eigen::Index n = state_size_, r = jacobian == nullptr ? 0 : x.size() - n;
-    for (Eigen::Index i = 0; i < x.size() - r; ++i) s.state[static_cast<size_t>(i)] = static_cast<T>(x[i]);
-    for (Eigen::Index i = 0; i < u.size(); ++i) s.input[static_cast<size_t>(i)] = static_cast<T>(u[i]);
+    while (!points.empty()) {
+      const std::span<const Point> together = points.first(std::min(points.size(), s.lanes.size()));
+      absl::InlinedVector<autodiff::Run<T>, kMostTogether> runs;
+      for (size_t i = 0; i < together.size(); ++i) runs.push_back(Begin(function, together[i], &s.lanes[i]));
+      autodiff::EvaluateTogether(with_jacobian_[function], std::span<const autodiff::Run<T>>(runs), s.arena);
+      for (size_t i = 0; i < together.size(); ++i) Finish(function, rows, together[i], &runs[i].slots, &s.lanes[i], s.arena);
+      points = points.subspan(together.size());
+    }
+  }
+
+  autodiff::Run<T> Begin(Function function, const Point& point, Lane* lane) const {
+    const TypedParameters& typed = static_cast<const TypedParameters&>(*point.parameters);
+    const Eigen::Index n = state_size_, r = point.x.size() - n;
+    lane->argument.head(n) = point.x.head(n).template cast<T>();
+    lane->input.head(point.u.size()) = point.u.template cast<T>();
     const T* omega = typed.values.data();
     if (r > 0) {
-      s.parameters = Eigen::Map<const Eigen::Matrix<T, Eigen::Dynamic, 1>>(omega, s.parameters.size());
-      for (Eigen::Index k = 0; k < r; ++k) s.parameters += static_cast<T>(x[n + k]) * typed.along.col(k);
-      omega = s.parameters.data();
+      lane->parameters = Eigen::Map<const Vector>(omega, model_.layout().size());
+      for (Eigen::Index k = 0; k < r; ++k) lane->parameters += static_cast<T>(point.x[n + k]) * typed.along.col(k);
+      omega = lane->parameters.data();
     }
-    Slots<T> slots;
-    slots.Input(kParameters, omega)
-        .Input(kState, s.state.data())
-        .Input(kInput, s.input.data())
-        .Output(kValueOut, s.value.data())
-        .Output(kJacobianOut, s.jacobian.data());
-    autodiff::Evaluate(executable, slots, s.arena);
-    for (Eigen::Index i = 0; i < rows; ++i) (*value)[i] = static_cast<double>(s.value[static_cast<size_t>(i)]);
-    if (jacobian == nullptr) return;
-    for (Eigen::Index k = 0; k < n; ++k) {
-      for (Eigen::Index i = 0; i < rows; ++i) (*jacobian)(i, k) = static_cast<double>(s.jacobian[static_cast<size_t>(k * rows + i)]);
-    }
+    autodiff::Run<T> run{.packed = r > 0 ? &typed.known[function] : &typed.packed->Of(function)};
+    run.slots.Input(kParameters, omega)
+        .Input(kState, lane->argument.data())
+        .Input(kInput, lane->input.data())
+        .Output(kValueOut, lane->value.data())
+        .Output(kJacobianOut, lane->jacobian.data());
+    return run;
+  }
+
+  void Finish(Function function, Eigen::Index rows, const Point& point, Slots<T>* slots, Lane* lane, const Arena<T>& arena) const {
+    const TypedParameters& typed = static_cast<const TypedParameters&>(*point.parameters);
+    const Eigen::Index n = state_size_, r = point.x.size() - n;
+    point.value->head(rows) = lane->value.head(rows).template cast<double>();
+    point.jacobian->block(0, 0, rows, n) = Eigen::Map<const Matrix>(lane->jacobian.data(), rows, n).template cast<double>();
     for (Eigen::Index k = 0; k < r; ++k) {
-      slots.Input(kDirection, typed.along.col(k).data());
-      autodiff::Evaluate(along, slots, s.arena);
-      for (Eigen::Index i = 0; i < rows; ++i) (*jacobian)(i, n + k) = static_cast<double>(s.value[static_cast<size_t>(i)]);
+      slots->Input(kDirection, typed.along.col(k).data());
+      autodiff::Evaluate(along_[function], *slots, arena);
+      point.jacobian->col(n + k).head(rows) = lane->value.head(rows).template cast<double>();
     }
   }
 
   const nssm::Model model_;
   std::optional<nssm::GaussianPrior> prior_;
-  Executable<T> transition_, measurement_, reconstruction_, encode_, transition_along_, measurement_along_, reconstruction_along_;
+  std::array<Executable<T>, kFunctions> with_jacobian_, along_;
+  Executable<T> encode_;
   int64_t argument_size_;
   int32_t input_size_, value_size_;
 };
 
 }  // namespace
 
-std::unique_ptr<FilterModel::Parameters> FilterModel::Prepare(const nssm::Bundle& bundle) const {
-  return Prepare(bundle.parameters, UnknownDirections(bundle));
+std::unique_ptr<FilterModel::Parameters> FilterModel::Prepare(const nssm::Bundle& bundle, const Parameters* base) const {
+  return Prepare(bundle.parameters, UnknownDirections(bundle), base);
+}
+
+void FilterModel::Transition(const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u, VectorXd* f,
+                             MatrixXd* F, Scratch* scratch) const {
+  const Point point = PointOf(parameters, x, u, f, F);
+  Transition({&point, 1}, scratch);
+}
+
+void FilterModel::Measurement(const Parameters& parameters, const Eigen::Ref<const VectorXd>& x, const Eigen::Ref<const VectorXd>& u, VectorXd* h,
+                              MatrixXd* H, Scratch* scratch) const {
+  const Point point = PointOf(parameters, x, u, h, H);
+  Measurement({&point, 1}, scratch);
 }
 
 std::unique_ptr<FilterModel> FilterModel::Create(const nssm::Bundle& bundle) {

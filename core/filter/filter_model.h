@@ -2,6 +2,7 @@
 
 #include <Eigen/Core>
 #include <memory>
+#include <span>
 #include <vector>
 
 #include "core/nssm/bundle.h"
@@ -37,24 +38,38 @@ class FilterModel {
     virtual ~Scratch() = default;
   };
 
+  /// One filter's evaluation of a function: of Transition, for example, value and jacobian are f and F.
+  struct Point {
+    const Parameters* parameters;
+    Eigen::Map<const Eigen::VectorXd> x;  ///< n, or n + r with z behind it
+    Eigen::Map<const Eigen::VectorXd> u;
+    Eigen::VectorXd* value;     ///< receives n rows, or of Measurement n_y
+    Eigen::MatrixXd* jacobian;  ///< ∂/∂x, receives so many rows and as many columns as x has; both may be larger
+  };
+
   /// Takes the architecture, and where the start is fitted the prior; not the parameters.
   static std::unique_ptr<FilterModel> Create(const nssm::Bundle& bundle);
   virtual ~FilterModel() = default;
 
   /// @param directions  V, n_ω × r.
-  virtual std::unique_ptr<Parameters> Prepare(const std::vector<double>& parameters, const Eigen::MatrixXd& directions) const = 0;
+  /// @param base  others of this model that these are adapted from, or null: weights that are the same are kept once, and points that have
+  ///   them are evaluated with one reading of them.
+  virtual std::unique_ptr<Parameters> Prepare(const std::vector<double>& parameters, const Eigen::MatrixXd& directions,
+                                              const Parameters* base = nullptr) const = 0;
   std::unique_ptr<Parameters> Prepare(const std::vector<double>& parameters) const { return Prepare(parameters, Eigen::MatrixXd()); }
   /// The bundle's parameters and what its posterior leaves open of them (UnknownDirections).
-  std::unique_ptr<Parameters> Prepare(const nssm::Bundle& bundle) const;
+  std::unique_ptr<Parameters> Prepare(const nssm::Bundle& bundle, const Parameters* base = nullptr) const;
   virtual std::unique_ptr<Scratch> MakeScratch() const = 0;
 
-  /// f and F = ∂f/∂x at (x, u). @param x  n, or n + r with z behind it. @param f  receives n rows. @param F  receives n rows and as many
-  /// columns as x has; both may be larger.
-  virtual void Transition(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
-                          Eigen::VectorXd* f, Eigen::MatrixXd* F, Scratch* scratch) const = 0;
-  /// h and H = ∂h/∂x at (x, u). @param H  receives n_y rows and as many columns as x has.
-  virtual void Measurement(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
-                           Eigen::VectorXd* h, Eigen::MatrixXd* H, Scratch* scratch) const = 0;
+  /// f and F = ∂f/∂x at (x, u) of every point. What comes out of one does not depend on the others.
+  virtual void Transition(std::span<const Point> points, Scratch* scratch) const = 0;
+  /// h and H = ∂h/∂x at (x, u) of every point.
+  virtual void Measurement(std::span<const Point> points, Scratch* scratch) const = 0;
+  /// At one point.
+  void Transition(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
+                  Eigen::VectorXd* f, Eigen::MatrixXd* F, Scratch* scratch) const;
+  void Measurement(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
+                   Eigen::VectorXd* h, Eigen::MatrixXd* H, Scratch* scratch) const;
   /// Case II: the autoencoder's x̄ = 𝓟x𝓓x𝓔(x, u) and ∂x̄/∂x. Sizes as those of Transition.
   virtual void Reconstruct(const Parameters& parameters, const Eigen::Ref<const Eigen::VectorXd>& x, const Eigen::Ref<const Eigen::VectorXd>& u,
                            Eigen::VectorXd* reconstruction, Eigen::MatrixXd* J, Scratch* scratch) const = 0;
@@ -66,6 +81,8 @@ class FilterModel {
   virtual Eigen::MatrixXd EncodedCovariance(const Scratch& scratch) const = 0;
 
   int32_t state_size() const { return state_size_; }
+  /// Whether weights are so many that points gain by being evaluated together.
+  virtual bool is_large() const = 0;
 
  protected:
   int32_t state_size_ = 0;

@@ -3,6 +3,8 @@
 #include <cmath>
 #include <utility>
 
+#include "absl/container/inlined_vector.h"
+
 namespace metaekf::filter {
 
 using Eigen::Index;
@@ -34,9 +36,32 @@ VectorXd JointModel::ExtraNoise() const {
   return deviations;
 }
 
+void JointModel::Evaluate(Together function, std::span<const Point> points, FilterModel::Scratch* scratch) {
+  if (points.empty()) return;
+  absl::InlinedVector<FilterModel::Point, 8> of_models;
+  for (const Point& p : points) {
+    of_models.push_back({p.joint->parameters_.get(), {p.s->data(), p.joint->bias_begin_}, {p.u->data(), p.u->size()}, p.value, p.jacobian});
+  }
+  (points.front().joint->model_.get()->*function)(of_models, scratch);
+}
+
+void JointModel::Transition(std::span<const Point> points, FilterModel::Scratch* scratch) {
+  Evaluate(&FilterModel::Transition, points, scratch);
+  for (const Point& p : points) p.joint->CompleteTransition(*p.s, p.value, p.jacobian);
+}
+
+void JointModel::Measurement(std::span<const Point> points, FilterModel::Scratch* scratch) {
+  Evaluate(&FilterModel::Measurement, points, scratch);
+  for (const Point& p : points) p.joint->CompleteMeasurement(*p.s, p.value, p.jacobian);
+}
+
 void JointModel::Transition(const Ref<const VectorXd>& s, const Ref<const VectorXd>& u, VectorXd* f, MatrixXd* F,
                             FilterModel::Scratch* scratch) const {
   model_->Transition(*parameters_, s.head(bias_begin_), u, f, F, scratch);
+  CompleteTransition(s, f, F);
+}
+
+void JointModel::CompleteTransition(const Ref<const VectorXd>& s, VectorXd* f, MatrixXd* F) const {
   Keep(s, f, F);
   const Index n = state_size_, c_f = process_bias_.loadings.cols(), c_h = measurement_bias_.loadings.cols(), all = size();
   if (c_f > 0) {
@@ -53,6 +78,10 @@ void JointModel::Transition(const Ref<const VectorXd>& s, const Ref<const Vector
 void JointModel::Measurement(const Ref<const VectorXd>& s, const Ref<const VectorXd>& u, VectorXd* h, MatrixXd* H,
                              FilterModel::Scratch* scratch) const {
   model_->Measurement(*parameters_, s.head(bias_begin_), u, h, H, scratch);
+  CompleteMeasurement(s, h, H);
+}
+
+void JointModel::CompleteMeasurement(const Ref<const VectorXd>& s, VectorXd* h, MatrixXd* H) const {
   const Index c_h = measurement_bias_.loadings.cols();
   H->middleCols(bias_begin_, process_bias_.loadings.cols()).setZero();
   if (c_h == 0) return;

@@ -2,6 +2,7 @@
 
 #include <Eigen/Core>
 #include <memory>
+#include <span>
 
 #include "core/filter/filter_model.h"
 
@@ -32,6 +33,18 @@ class JointModel {
   /// Deviations of the process noise of z and c.
   Eigen::VectorXd ExtraNoise() const;
 
+  /// One filter's evaluation of a function.
+  struct Point {
+    const JointModel* joint;
+    const Eigen::VectorXd* s;
+    const Eigen::VectorXd* u;
+    Eigen::VectorXd* value;
+    Eigen::MatrixXd* jacobian;
+  };
+  /// Transition and Measurement of several filters on one FilterModel (FilterModel::Point).
+  static void Transition(std::span<const Point> points, FilterModel::Scratch* scratch);
+  static void Measurement(std::span<const Point> points, FilterModel::Scratch* scratch);
+
   /// f and F = ∂f/∂s at (s, u). @param F  size() × size().
   void Transition(const Eigen::Ref<const Eigen::VectorXd>& s, const Eigen::Ref<const Eigen::VectorXd>& u, Eigen::VectorXd* f, Eigen::MatrixXd* F,
                   FilterModel::Scratch* scratch) const;
@@ -45,6 +58,11 @@ class JointModel {
   void Encode(const Eigen::Ref<const Eigen::VectorXd>& window, Eigen::VectorXd* latent, FilterModel::Scratch* scratch) const;
 
  private:
+  using Together = void (FilterModel::*)(std::span<const FilterModel::Point>, FilterModel::Scratch*) const;
+  static void Evaluate(Together function, std::span<const Point> points, FilterModel::Scratch* scratch);
+  /// What the model has said of x, with the rest.
+  void CompleteTransition(const Eigen::Ref<const Eigen::VectorXd>& s, Eigen::VectorXd* f, Eigen::MatrixXd* F) const;
+  void CompleteMeasurement(const Eigen::Ref<const Eigen::VectorXd>& s, Eigen::VectorXd* h, Eigen::MatrixXd* H) const;
   /// What is beside x stays as it is.
   void Keep(const Eigen::Ref<const Eigen::VectorXd>& s, Eigen::VectorXd* value, Eigen::MatrixXd* jacobian) const;
 

@@ -3,6 +3,7 @@
 #include <cmath>
 #include <utility>
 
+#include "absl/container/inlined_vector.h"
 #include "core/base/status.h"
 
 namespace metaekf::filter {
@@ -36,13 +37,37 @@ void Merge(const Ref<const VectorXd>& output, const MatrixXd* measurement_cov, c
 
 absl::Status ReplayFilter::Step(const Ref<const VectorXd>& input, const Ref<const VectorXd>& output,
                                 FilterModel::Scratch* scratch, Estimate* estimate, const MatrixXd* measurement_cov) {
-  if (lag_ == 0) return ekf_.Step(input, output, scratch, estimate, measurement_cov);
-  Entry entry{.before = ekf_.state(), .sample = {.input = input, .output = output}};
-  if (measurement_cov != nullptr) entry.sample.measurement_cov = *measurement_cov;
-  METAEKF_RETURN_IF_ERROR(ekf_.Step(input, output, scratch, estimate, measurement_cov));
+  METAEKF_RETURN_IF_ERROR(ekf_.CheckSizes(input.size(), output.size()));
+  NextReplaySample sample{this, input.data(), output.data(), measurement_cov, estimate, absl::OkStatus()};
+  StepTogether({&sample, 1}, scratch);
+  return sample.status;
+}
+
+void StepTogether(std::span<NextReplaySample> samples, FilterModel::Scratch* scratch) {
+  absl::InlinedVector<NextSample, 8> steps;
+  for (const NextReplaySample& s : samples) {
+    s.filter->Remember(s);
+    steps.push_back({&s.filter->ekf_, s.input, s.output, s.measurement_cov, s.estimate, absl::OkStatus()});
+  }
+  StepTogether(std::span<NextSample>(steps), scratch);
+  for (size_t i = 0; i < steps.size(); ++i) {
+    samples[i].status = std::move(steps[i].status);
+    ReplayFilter* const filter = samples[i].filter;
+    if (filter->lag_ == 0) continue;
+    if (!samples[i].status.ok()) {
+      filter->entries_.pop_back();
+    } else if (filter->remembered() > filter->lag_ + 1) {
+      filter->entries_.pop_front();
+    }
+  }
+}
+
+void ReplayFilter::Remember(const NextReplaySample& next) {
+  if (lag_ == 0) return;
+  Entry entry{.before = ekf_.state(),
+              .sample = {.input = Eigen::Map<const VectorXd>(next.input, ekf_.input_size()), .output = Eigen::Map<const VectorXd>(next.output, ekf_.output_size())}};
+  if (next.measurement_cov != nullptr) entry.sample.measurement_cov = *next.measurement_cov;
   entries_.push_back(std::move(entry));
-  if (remembered() > lag_ + 1) entries_.pop_front();
-  return absl::OkStatus();
 }
 
 absl::Status ReplayFilter::StepDelayed(int64_t back, const Ref<const VectorXd>& output, FilterModel::Scratch* scratch,

@@ -13,6 +13,12 @@ struct Sample {
   std::optional<Eigen::MatrixXd> measurement_cov;  ///< R of this sample; without it the filter's
 };
 
+class ReplayFilter;
+using NextReplaySample = NextSampleOf<ReplayFilter>;
+
+/// ReplayFilter::Step of filters on one FilterModel, as those of Ekf.
+void StepTogether(std::span<NextReplaySample> samples, FilterModel::Scratch* scratch);
+
 /// An Ekf that remembers its last samples with the states before them, so that a measurement that comes late is applied at its
 /// own time: the filter goes back there and repeats all samples since. What it gives then is what it would have given had the
 /// measurement come in time.
@@ -43,10 +49,12 @@ class ReplayFilter {
   absl::Status Restore(FilterState oldest_state, const std::vector<Sample>& samples, FilterModel::Scratch* scratch);
 
  private:
+  friend void StepTogether(std::span<NextReplaySample> samples, FilterModel::Scratch* scratch);
   struct Entry {
     FilterState before;
     Sample sample;
   };
+  void Remember(const NextReplaySample& next);
 
   Ekf ekf_;
   int64_t lag_;

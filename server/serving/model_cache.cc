@@ -54,7 +54,7 @@ ModelCache::Loaded ModelCache::GetVersion(const store::ModelVersion& version) {
     METAEKF_ASSIGN_OR_RETURN(const std::string bytes, store_.models().ReadFile(version));
     auto bundle = nssm::ReadModelFile(bytes);
     METAEKF_RETURN_IF_ERROR(AsDataLoss(bundle.status(), name));
-    return Serve(*std::move(bundle), name, "");
+    return Serve(*std::move(bundle), name, "", nullptr);
   });
 }
 
@@ -71,7 +71,7 @@ ModelCache::Loaded ModelCache::GetAdaptation(const std::string& id) {
     METAEKF_ASSIGN_OR_RETURN(const std::string bytes, store_.adaptations().ReadFile(adaptation));
     nssm::Bundle bundle = base->bundle;
     METAEKF_RETURN_IF_ERROR(AsDataLoss(nssm::ApplyAdaptedSubset(bytes, &bundle), name));
-    return Serve(std::move(bundle), base->model_version, name);
+    return Serve(std::move(bundle), base->model_version, name, base);
   });
 }
 
@@ -110,10 +110,12 @@ ModelCache::Loaded ModelCache::GetOrLoad(const std::string& key, const Load& loa
 }
 
 ModelCache::Loaded ModelCache::Serve(nssm::Bundle bundle, const std::string& version,
-                                     const std::string& adaptation) {
+                                     const std::string& adaptation, const Model& base) {
   auto model = std::make_shared<ServedModel>(ServedModel{.bundle = std::move(bundle)});
   model->filter_model = FilterModelOf(model->bundle, version);
-  model->filter_parameters = model->filter_model->Prepare(model->bundle);
+  // What an adaptation leaves as it was is kept once.
+  const bool shares = base != nullptr && base->filter_model == model->filter_model;
+  model->filter_parameters = model->filter_model->Prepare(model->bundle, shares ? base->filter_parameters.get() : nullptr);
   model->model_version = version;
   model->adaptation = adaptation;
   return model;

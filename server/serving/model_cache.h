@@ -54,7 +54,8 @@ class ModelCache {
   /// From the cache, from whoever loads it now, or by `load`.
   template <class Load>
   Loaded GetOrLoad(const std::string& key, const Load& load);
-  Loaded Serve(nssm::Bundle bundle, const std::string& version, const std::string& adaptation);
+  /// @param base  that the bundle is adapted from, or null.
+  Loaded Serve(nssm::Bundle bundle, const std::string& version, const std::string& adaptation, const Model& base);
   std::shared_ptr<const filter::FilterModel> FilterModelOf(const nssm::Bundle& bundle,
                                                           const std::string& version);
   void Keep(const Model& model);  // with mutex_ held

@@ -1,6 +1,7 @@
 #include "server/session/estimation_service.h"
 
 #include <algorithm>
+#include <limits>
 #include <optional>
 #include <vector>
 
@@ -22,11 +23,6 @@ constexpr std::chrono::seconds kSlowReader(10);      // a response that waits lo
 constexpr std::chrono::milliseconds kSweepPeriod(500);
 // Longer batches go to threads of their own. To wake one costs as much as 64 samples of a small model.
 constexpr std::chrono::microseconds kLongReaction(200);
-constexpr size_t kMaxHeavyBatches = 20'000;  // each stream has one at most
-
-absl::Status TakenOver() {
-  return WithReason(absl::AbortedError("another stream has resumed the session, or it was deleted"), "SESSION_TAKEN_OVER", {});
-}
 
 absl::Status Draining(uint64_t durable_seq) {
   return WithReason(
@@ -143,18 +139,38 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
 
   /// With mutex_ held and working_ set.
   void StartWork() {
-    if (live_ != nullptr && ValuesOf(work_) * time_per_value_ <= kLongReaction) {
+    if (live_ != nullptr && ValuesOf(work_) * time_per_value_ <= kLongReaction && (!queues() || live_->queue->Enter())) {
       // The batch is short: applied in this reaction, but without the mutex, which the caller holds. Reading on waits for the response
       // to be on its way, which a single sensor's latency is made of.
       mutex_.unlock();
       const absl::Status status = Apply();
+      if (queues() && live_->queue->Leave()) service_.WorkThrough(live_->queue);
       mutex_.lock();
       return WorkDone(status);
     }
     Read();
+    if (live_ != nullptr && queues()) {
+      response_.Clear();
+      if (live_->queue->Add({live_, &work_.samples(), response_.mutable_estimates(), [this](const absl::Status& status, auto cost) { Applied(status, cost); }})) {
+        service_.WorkThrough(live_->queue);
+      }
+      return;
+    }
     const bool accepted = live_ == nullptr ? service_.io_.Submit([this] { Work([this] { return OpenOrResume(); }); })
                                            : service_.heavy_.Submit([this] { Work([this] { return Apply(); }); });
     if (!accepted) WorkDone(Overloaded());
+  }
+
+  /// Whether batches of many sessions of this model are applied together where they wait.
+  bool queues() const { return work_.has_samples() && live_->queue->model()->is_large(); }
+
+  void Applied(const absl::Status& status, steady_clock::duration cost) {
+    if (response_.estimates().nis_size() > 0) {
+      service_.sessions_.MarkDirty(live_);
+      time_per_value_ = cost / work_.samples().outputs_size();
+    }
+    std::lock_guard lock(mutex_);
+    WorkDone(status);
   }
 
   /// With mutex_ held.
@@ -226,7 +242,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
     }
     response_.Clear();
     const steady_clock::time_point start = steady_clock::now();
-    std::unique_ptr<filter::FilterModel::Scratch> scratch = live_->scratch->Take();
+    std::unique_ptr<filter::FilterModel::Scratch> scratch = live_->queue->Take();
     absl::Status status;
     bool applied = false;
     {
@@ -240,12 +256,11 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
       } else {
         v1::EstimateBatch* estimates = response_.mutable_estimates();
         status = live_->session->Apply(work_.samples(), scratch.get(), estimates);
-        estimates->set_durable_seq(live_->durable_seq);
+        CompleteAnswer(*live_, estimates);
         applied = estimates->nis_size() > 0;
-        if (!applied) estimates->set_first_seq(live_->session->applied_seq());
       }
     }
-    live_->scratch->GiveBack(std::move(scratch));
+    live_->queue->GiveBack(std::move(scratch));
     if (applied) service_.sessions_.MarkDirty(live_);
     const int64_t values = ValuesOf(work_);
     if (values > 0) time_per_value_ = (steady_clock::now() - start) / values;
@@ -274,7 +289,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
 };
 
 EstimationService::EstimationService(SessionManager& sessions, BackgroundExecutor& io)
-    : sessions_(sessions), io_(io), heavy_({.threads = 2, .max_queued = kMaxHeavyBatches}), sweeps_([this] { RunSweeps(); }) {}
+    : sessions_(sessions), io_(io), heavy_({.threads = 2, .max_queued = std::numeric_limits<size_t>::max()}), sweeps_([this] { RunSweeps(); }) {}
 
 EstimationService::~EstimationService() {
   {
@@ -296,6 +311,12 @@ grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse>* EstimationSe
   }
   stream->Start(draining);
   return stream;
+}
+
+void EstimationService::WorkThrough(const std::shared_ptr<BatchQueue>& queue) {
+  (void)heavy_.Submit([this, queue] {
+    if (queue->Work()) WorkThrough(queue);
+  });
 }
 
 void EstimationService::Remove(EstimateStream* stream) {

@@ -2,6 +2,7 @@
 
 #include <chrono>
 #include <condition_variable>
+#include <memory>
 #include <mutex>
 #include <set>
 #include <thread>
@@ -37,11 +38,13 @@ class EstimationService : public v1::EstimationService::CallbackService {
  private:
   friend class EstimateStream;
   void Remove(EstimateStream* stream);
+  /// Has batches that wait applied.
+  void WorkThrough(const std::shared_ptr<BatchQueue>& queue);
   void RunSweeps();
 
   SessionManager& sessions_;
   BackgroundExecutor& io_;
-  BackgroundExecutor heavy_;  // batches that take longer than a reaction may
+  BackgroundExecutor heavy_;  // batches that take longer than a reaction may; each stream has one at most
 
   std::mutex mutex_;
   std::condition_variable changed_;

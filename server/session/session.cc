@@ -87,7 +87,8 @@ Session::Session(std::shared_ptr<const ServedModel> model, filter::ReplayFilter 
                                 : open.covariance_format(),
               .innovations = open.send_innovations(),
               .constrained = filter_.ekf().constrained()},
-      period_s_(model_->bundle.sample_period_s) {}
+      period_s_(model_->bundle.sample_period_s),
+      nothing_(VectorXd::Constant(filter_.ekf().output_size(), std::numeric_limits<double>::quiet_NaN())) {}
 
 void Session::Describe(v1::SessionOpened* opened) const {
   const nssm::Bundle& bundle = model_->bundle;
@@ -188,52 +189,86 @@ absl::StatusOr<int64_t> Session::PeriodsTo(double time_s, double last_time_s, in
 
 absl::Status Session::Apply(const v1::SampleBatch& batch, filter::FilterModel::Scratch* scratch,
                             EstimateBatch* estimates) {
-  const int64_t rows = batch.outputs_size() / filter_.ekf().output_size();
-  METAEKF_RETURN_IF_ERROR(Check(batch, rows));
-  for (int64_t row = 0; row < rows; ++row) {
-    if (batch.first_seq() + static_cast<uint64_t>(row) <= seq_) continue;
-    METAEKF_RETURN_IF_ERROR(ApplyRow(batch, row, scratch, estimates));
+  Application application;
+  METAEKF_RETURN_IF_ERROR(Begin(batch, estimates, &application));
+  while (true) {
+    filter::NextReplaySample step;
+    METAEKF_ASSIGN_OR_RETURN(const bool more, Next(&application, scratch, &step));
+    if (!more) return absl::OkStatus();
+    StepTogether({&step, 1}, scratch);
+    METAEKF_RETURN_IF_ERROR(Taught(step, &application));
   }
+}
+
+absl::Status Session::Begin(const v1::SampleBatch& batch, EstimateBatch* estimates, Application* application) const {
+  METAEKF_RETURN_IF_ERROR(Check(batch, batch.outputs_size() / filter_.ekf().output_size()));
+  *application = {.batch = &batch, .estimates = estimates};
+  if (batch.first_seq() <= seq_) application->row = static_cast<int64_t>(seq_ + 1 - batch.first_seq());
   return absl::OkStatus();
 }
 
-absl::Status Session::ApplyRow(const v1::SampleBatch& batch, int64_t row, filter::FilterModel::Scratch* scratch,
-                               EstimateBatch* estimates) {
-  const int64_t n_u = filter_.ekf().input_size(), n_y = filter_.ekf().output_size();
-  const double* const output = batch.outputs().data() + row * n_y;
-  const Eigen::Map<const VectorXd> u(batch.inputs().data() + row * n_u, n_u), y(output, n_y);
-  std::optional<MatrixXd> R;
-  if (!batch.measurement_noise_covs().empty()) {
-    METAEKF_ASSIGN_OR_RETURN(R, NoiseOf(batch, batch.outputs_size() / n_y, row, n_y));
-  }
-  const MatrixXd* const noise = R ? &*R : nullptr;
-  double time = seq_ == 0 ? 0 : time_s_ + period_s_;
-  int64_t periods = 1;
-  if (!batch.times_s().empty()) {
-    time = batch.times_s(static_cast<int>(row));
-    if (seq_ > 0) {
-      METAEKF_ASSIGN_OR_RETURN(periods, PeriodsTo(time, time_s_, filter_.remembered()));
+absl::StatusOr<bool> Session::Next(Application* application, filter::FilterModel::Scratch* scratch, filter::NextReplaySample* next) {
+  const v1::SampleBatch& batch = *application->batch;
+  const int64_t n_u = filter_.ekf().input_size(), n_y = filter_.ekf().output_size(), rows = batch.outputs_size() / n_y;
+  for (; application->row < rows; ++application->row) {
+    const Eigen::Map<const VectorXd> u(batch.inputs().data() + application->row * n_u, n_u), y(batch.outputs().data() + application->row * n_y, n_y);
+    if (!application->dated) {
+      METAEKF_ASSIGN_OR_RETURN(const int64_t periods, Date(application));
+      if (periods < 1) {
+        const MatrixXd* const R = application->measurement_cov ? &*application->measurement_cov : nullptr;
+        METAEKF_RETURN_IF_ERROR(filter_.StepDelayed(-periods, y, scratch, &estimate_, R));
+        Write(EstimateBatch::DELAYED, application);
+        continue;
+      }
+      application->missed = periods - 1;
+      application->dated = true;
     }
-  }
-  if (periods < 1) {
-    METAEKF_RETURN_IF_ERROR(filter_.StepDelayed(-periods, y, scratch, &estimate_, noise));
-  } else {
-    // Periods without a sample: time passes, under the input that was last known.
-    const VectorXd nothing = VectorXd::Constant(n_y, std::numeric_limits<double>::quiet_NaN());
-    for (int64_t missed = 1; missed < periods; ++missed) {
-      METAEKF_RETURN_IF_ERROR(filter_.Step(filter_.ekf().LastInput(), nothing, scratch, &estimate_));
+    if (application->missed > 0) {
+      // A period without a sample: time passes, under the input that was last known.
+      application->last_input = filter_.ekf().LastInput();
+      *next = {&filter_, application->last_input.data(), nothing_.data(), nullptr, &estimate_, absl::OkStatus()};
+    } else {
+      const MatrixXd* const R = application->measurement_cov ? &*application->measurement_cov : nullptr;
+      *next = {&filter_, u.data(), y.data(), R, &estimate_, absl::OkStatus()};
     }
-    METAEKF_RETURN_IF_ERROR(filter_.Step(u, y, scratch, &estimate_, noise));
-    time_s_ = time;
+    return true;
   }
-  ++seq_;
-  if (estimates->times_s().empty()) estimates->set_first_seq(seq_);
-  bool missing = false;
-  for (int64_t i = 0; i < n_y; ++i) missing = missing || std::isnan(output[i]);
-  uint32_t flags = missing ? EstimateBatch::MISSING : EstimateBatch::NO_FLAG;
-  if (periods < 1) flags |= EstimateBatch::DELAYED;
-  WriteEstimate(format_, time, estimate_, flags, estimates);
+  return false;
+}
+absl::Status Session::Taught(const filter::NextReplaySample& step, Application* application) {
+  METAEKF_RETURN_IF_ERROR(step.status);
+  if (application->missed > 0) {
+    --application->missed;
+    return absl::OkStatus();
+  }
+  time_s_ = application->time_s;
+  Write(EstimateBatch::NO_FLAG, application);
+  ++application->row;
+  application->dated = false;
   return absl::OkStatus();
+}
+
+absl::StatusOr<int64_t> Session::Date(Application* application) const {
+  const v1::SampleBatch& batch = *application->batch;
+  const int64_t n_y = filter_.ekf().output_size();
+  application->measurement_cov.reset();
+  if (!batch.measurement_noise_covs().empty()) {
+    METAEKF_ASSIGN_OR_RETURN(application->measurement_cov, NoiseOf(batch, batch.outputs_size() / n_y, application->row, n_y));
+  }
+  application->time_s = seq_ == 0 ? 0 : time_s_ + period_s_;
+  if (batch.times_s().empty()) return 1;
+  application->time_s = batch.times_s(static_cast<int>(application->row));
+  if (seq_ == 0) return 1;
+  return PeriodsTo(application->time_s, time_s_, filter_.remembered());
+}
+
+void Session::Write(uint32_t flags, Application* application) {
+  const int64_t n_y = filter_.ekf().output_size();
+  const double* const output = application->batch->outputs().data() + application->row * n_y;
+  ++seq_;
+  if (application->estimates->times_s().empty()) application->estimates->set_first_seq(seq_);
+  if (std::any_of(output, output + n_y, [](double y) { return std::isnan(y); })) flags |= EstimateBatch::MISSING;
+  WriteEstimate(format_, application->time_s, estimate_, flags, application->estimates);
 }
 
 absl::Status Session::Forecast(const v1::ForecastRequest& request, filter::FilterModel::Scratch* scratch,

@@ -2,6 +2,7 @@
 
 #include <cstdint>
 #include <memory>
+#include <optional>
 #include <string>
 
 #include "absl/status/statusor.h"
@@ -25,6 +26,26 @@ class Session {
   /// session is unchanged then.
   absl::Status Apply(const v1::SampleBatch& batch, filter::FilterModel::Scratch* scratch, v1::EstimateBatch* estimates);
 
+  /// A batch on its way through a session, of which step by step is given to filter::StepTogether:
+  ///
+  ///   Begin, then while Next is true: the step, Taught
+  struct Application {
+    const v1::SampleBatch* batch = nullptr;
+    v1::EstimateBatch* estimates = nullptr;
+    int64_t row = 0;     ///< of the batch, that is next
+    bool dated = false;  ///< `time_s` and `missed` are those of `row`
+    double time_s = 0;
+    int64_t missed = 0;  ///< periods before it that pass without a sample
+    std::optional<Eigen::MatrixXd> measurement_cov;
+    Eigen::VectorXd last_input;
+  };
+  /// Errors: those of Apply.
+  absl::Status Begin(const v1::SampleBatch& batch, v1::EstimateBatch* estimates, Application* application) const;
+  /// @param next  receives the next step, if there is one; it refers to `application`. What is late is applied on the way.
+  absl::StatusOr<bool> Next(Application* application, filter::FilterModel::Scratch* scratch, filter::NextReplaySample* next);
+  /// After the step.
+  absl::Status Taught(const filter::NextReplaySample& step, Application* application);
+
   /// Writes what the samples after the newest will be like. Errors: InvalidArgument with violations below `forecast`.
   absl::Status Forecast(const v1::ForecastRequest& request, filter::FilterModel::Scratch* scratch,
                         v1::EstimateBatch* forecast) const;
@@ -46,8 +67,9 @@ class Session {
   /// Periods from the last sample to one at `time_s`: 1 if none is missing between them, 0 or less for a late measurement of one
   /// of the `remembered` samples, the last included.
   absl::StatusOr<int64_t> PeriodsTo(double time_s, double last_time_s, int64_t remembered) const;
-  absl::Status ApplyRow(const v1::SampleBatch& batch, int64_t row, filter::FilterModel::Scratch* scratch,
-                        v1::EstimateBatch* estimates);
+  /// When the row was measured, and how many periods after the newest.
+  absl::StatusOr<int64_t> Date(Application* application) const;
+  void Write(uint32_t flags, Application* application);
 
   const std::shared_ptr<const ServedModel> model_;
   filter::ReplayFilter filter_;
@@ -56,6 +78,7 @@ class Session {
   const double period_s_;
   uint64_t seq_ = 0;    // the last sample applied
   double time_s_ = 0;   // of the newest
+  const Eigen::VectorXd nothing_;  // measured: NaN
 };
 
 }  // namespace metaekf::server

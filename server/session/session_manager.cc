@@ -16,23 +16,6 @@ constexpr std::chrono::milliseconds kCommitPeriod(100);
 
 }  // namespace
 
-std::unique_ptr<filter::FilterModel::Scratch> ScratchPool::Take() {
-  {
-    std::lock_guard lock(mutex_);
-    if (!free_.empty()) {
-      auto scratch = std::move(free_.back());
-      free_.pop_back();
-      return scratch;
-    }
-  }
-  return model_->MakeScratch();
-}
-
-void ScratchPool::GiveBack(std::unique_ptr<filter::FilterModel::Scratch> scratch) {
-  std::lock_guard lock(mutex_);
-  free_.push_back(std::move(scratch));
-}
-
 SessionManager::SessionManager(store::Store& store, ModelCache& models)
     : store_(store), models_(models), checkpoints_([this] { RunCheckpoints(); }) {}
 
@@ -77,10 +60,10 @@ absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Resume(const v1::Re
   METAEKF_ASSIGN_OR_RETURN(const std::shared_ptr<const ServedModel> model, models_.Get("target", settings.target()));
   METAEKF_ASSIGN_OR_RETURN(std::unique_ptr<Session> session, Session::Open(model, settings));
   if (!stored.checkpoint.empty()) {
-    const std::shared_ptr<ScratchPool> pool = PoolOf(model->filter_model);
-    std::unique_ptr<filter::FilterModel::Scratch> scratch = pool->Take();
+    const std::shared_ptr<BatchQueue> queue = QueueOf(model->filter_model);
+    std::unique_ptr<filter::FilterModel::Scratch> scratch = queue->Take();
     const absl::Status restored = session->Restore(stored.checkpoint, scratch.get());
-    pool->GiveBack(std::move(scratch));
+    queue->GiveBack(std::move(scratch));
     METAEKF_RETURN_IF_ERROR(restored);
   }
   return Attach(stored, "", std::move(session), model->filter_model);
@@ -94,7 +77,7 @@ std::shared_ptr<LiveSession> SessionManager::Attach(const store::Session& stored
   live->token = token;
   live->durable_seq = static_cast<uint64_t>(stored.durable_seq);
   live->session = std::move(session);
-  live->scratch = PoolOf(model);
+  live->queue = QueueOf(model);
   std::shared_ptr<LiveSession> before;
   {
     std::lock_guard lock(mutex_);
@@ -107,16 +90,16 @@ std::shared_ptr<LiveSession> SessionManager::Attach(const store::Session& stored
   return live;
 }
 
-std::shared_ptr<ScratchPool> SessionManager::PoolOf(const std::shared_ptr<const filter::FilterModel>& model) {
+std::shared_ptr<BatchQueue> SessionManager::QueueOf(const std::shared_ptr<const filter::FilterModel>& model) {
   std::lock_guard lock(mutex_);
-  std::erase_if(pools_, [](const std::weak_ptr<ScratchPool>& pool) { return pool.expired(); });
-  for (const std::weak_ptr<ScratchPool>& weak : pools_) {
-    std::shared_ptr<ScratchPool> pool = weak.lock();
-    if (pool != nullptr && pool->model() == model) return pool;
+  std::erase_if(queues_, [](const std::weak_ptr<BatchQueue>& queue) { return queue.expired(); });
+  for (const std::weak_ptr<BatchQueue>& weak : queues_) {
+    std::shared_ptr<BatchQueue> queue = weak.lock();
+    if (queue != nullptr && queue->model() == model) return queue;
   }
-  auto pool = std::make_shared<ScratchPool>(model);
-  pools_.push_back(pool);
-  return pool;
+  auto queue = std::make_shared<BatchQueue>(model);
+  queues_.push_back(queue);
+  return queue;
 }
 
 void SessionManager::MarkDirty(const std::shared_ptr<LiveSession>& live) {

@@ -11,38 +11,10 @@
 
 #include "absl/status/statusor.h"
 #include "server/serving/model_cache.h"
-#include "server/session/session.h"
+#include "server/session/batch_queue.h"
 #include "server/store/store.h"
 
 namespace metaekf::server {
-
-/// Scratch memory for the filters of one model, lent for the duration of a batch.
-class ScratchPool {
- public:
-  explicit ScratchPool(std::shared_ptr<const filter::FilterModel> model) : model_(std::move(model)) {}
-
-  std::unique_ptr<filter::FilterModel::Scratch> Take();
-  void GiveBack(std::unique_ptr<filter::FilterModel::Scratch> scratch);
-  const std::shared_ptr<const filter::FilterModel>& model() const { return model_; }
-
- private:
-  const std::shared_ptr<const filter::FilterModel> model_;
-  std::mutex mutex_;
-  std::vector<std::unique_ptr<filter::FilterModel::Scratch>> free_;
-};
-
-/// A session that a stream serves. `mutex` guards all but the constants.
-struct LiveSession {
-  int64_t number = 0;
-  uint64_t epoch = 0;
-  std::string token;  ///< of a session just made; empty when resumed
-  std::shared_ptr<ScratchPool> scratch;
-
-  std::mutex mutex;
-  std::unique_ptr<Session> session;
-  uint64_t durable_seq = 0;
-  bool taken_over = false;  ///< another stream has claimed the session
-};
 
 /// Sessions between their streams and the store. Safe to call concurrently; Open, Resume, Flush and Delete block on
 /// SQL and files.
@@ -69,7 +41,7 @@ class SessionManager {
   /// Puts a session behind its stream, and tells the stream that had it before.
   std::shared_ptr<LiveSession> Attach(const store::Session& stored, const std::string& token, std::unique_ptr<Session> session,
                                       const std::shared_ptr<const filter::FilterModel>& model);
-  std::shared_ptr<ScratchPool> PoolOf(const std::shared_ptr<const filter::FilterModel>& model);
+  std::shared_ptr<BatchQueue> QueueOf(const std::shared_ptr<const filter::FilterModel>& model);
   v1::Session ToMessage(const store::Session& stored);
   void RunCheckpoints();
 
@@ -78,7 +50,7 @@ class SessionManager {
   std::mutex mutex_;
   std::map<int64_t, std::shared_ptr<LiveSession>> live_;
   std::set<std::shared_ptr<LiveSession>> dirty_;
-  std::vector<std::weak_ptr<ScratchPool>> pools_;
+  std::vector<std::weak_ptr<BatchQueue>> queues_;
   bool stopping_ = false;
   std::condition_variable stop_;
   std::mutex flush_mutex_;  // one commit at a time

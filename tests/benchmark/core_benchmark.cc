@@ -8,6 +8,7 @@
 #include <cstdio>
 #include <functional>
 #include <map>
+#include <span>
 #include <string>
 #include <thread>
 #include <vector>
@@ -36,17 +37,41 @@ double MedianSeconds(int repeats, const std::function<void()>& work) {
   return benchmark::Median(std::move(seconds));
 }
 
-double EkfStepSeconds() {
-  nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(benchmark::LocalisationSpec()));
-  bundle.parameters = bundle.model.InitialParameters(1);
-  const std::shared_ptr<filter::FilterModel> model = filter::FilterModel::Create(bundle);
-  filter::Ekf ekf = *filter::Ekf::Create(bundle, model, model->Prepare(bundle.parameters), {});
-  const auto scratch = model->MakeScratch();
-  filter::Estimate estimate = ekf.MakeEstimate();
-  const Eigen::VectorXd u = Eigen::VectorXd::Constant(3, 0.3), y = Eigen::VectorXd::Constant(2, 0.1);
-  (void)ekf.Step(u, y, scratch.get(), &estimate);  // the first step has no time update
-  return MedianSeconds(2000, [&] { (void)ekf.Step(u, y, scratch.get(), &estimate); });
-}
+/// Filters of so many adaptations that have all but their decoders in common.
+class EkfSteps {
+ public:
+  explicit EkfSteps(size_t filters) {
+    nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(benchmark::LocalisationSpec()));
+    bundle.parameters = bundle.model.InitialParameters(1);
+    model_ = filter::FilterModel::Create(bundle);
+    scratch_ = model_->MakeScratch();
+    const std::shared_ptr<const filter::FilterModel::Parameters> base = model_->Prepare(bundle.parameters);
+    const nn::Mask adapted = *nn::ParseMask("*_decoder", bundle.model.layout());
+    for (size_t i = 0; i < filters; ++i) {
+      std::vector<double> own = bundle.parameters;
+      for (const auto& [offset, size] : nn::PiecesOf(bundle.model.layout(), adapted, true)) {
+        for (int64_t k = offset; k < offset + size; ++k) own[static_cast<size_t>(k)] *= 1 + 1e-3 * static_cast<double>(i + 1);
+      }
+      filters_.push_back(*filter::Ekf::Create(bundle, model_, model_->Prepare(own, Eigen::MatrixXd(), base.get()), {}));
+      estimates_.push_back(filters_.back().MakeEstimate());
+    }
+    for (size_t i = 0; i < filters; ++i) samples_.push_back({&filters_[i], u_.data(), y_.data(), nullptr, &estimates_[i], absl::OkStatus()});
+    StepTogether();  // the first step has no time update
+  }
+
+  void StepEach() {
+    for (filter::NextSample& sample : samples_) filter::StepTogether({&sample, 1}, scratch_.get());
+  }
+  void StepTogether() { filter::StepTogether(std::span<filter::NextSample>(samples_), scratch_.get()); }
+
+ private:
+  const Eigen::VectorXd u_ = Eigen::VectorXd::Constant(3, 0.3), y_ = Eigen::VectorXd::Constant(2, 0.1);
+  std::shared_ptr<const filter::FilterModel> model_;
+  std::unique_ptr<filter::FilterModel::Scratch> scratch_;
+  std::vector<filter::Ekf> filters_;
+  std::vector<filter::Estimate> estimates_;
+  std::vector<filter::NextSample> samples_;
+};
 
 struct MetaSeconds {
   double adapt, maml, fomaml;
@@ -116,14 +141,21 @@ nlohmann::json RunPeer(const std::string& script) {
 
 int Main(const std::string& peer_script, const std::string& json) {
   std::map<std::string, std::vector<double>> ours, peers;
+  std::vector<double> one_by_one, together;
   for (int round = 0; round < (peer_script.empty() ? 1 : kRounds); ++round) {
     const MetaSeconds learning = LocalisationLearning();
-    ours["ekf_step_us"].push_back(1e6 * EkfStepSeconds());
+    {
+      EkfSteps one(1);
+      ours["ekf_step_us"].push_back(1e6 * MedianSeconds(2000, [&] { one.StepEach(); }));
+    }
     ours["adapt_ms"].push_back(1e3 * learning.adapt);
     ours["maml_ms"].push_back(1e3 * learning.maml);
     ours["fomaml_ms"].push_back(1e3 * learning.fomaml);
     ours["rollout_grad_ms"].push_back(1e3 * SmallRolloutSeconds());
-    if (round == 0) ours["peak_rss_mib"].push_back(PeakRssMib());
+    if (round == 0) ours["peak_rss_mib"].push_back(PeakRssMib());  // of what the peer does, too
+    EkfSteps eight(8);
+    one_by_one.push_back(1e6 * MedianSeconds(250, [&] { eight.StepEach(); }));
+    together.push_back(1e6 * MedianSeconds(250, [&] { eight.StepTogether(); }));
     if (peer_script.empty()) break;
     const nlohmann::json peer = RunPeer(peer_script);
     if (peer.is_null()) {
@@ -138,6 +170,8 @@ int Main(const std::string& peer_script, const std::string& json) {
     rows.push_back({what, unit, own, peer, peer / own, ratio_key});
   };
   add("EKF step", "µs", "ekf_step_us", "ekf_step");
+  rows.push_back({"EKF steps of eight adaptations, together (beside: one by one)", "µs", benchmark::Median(together), benchmark::Median(one_by_one),
+                  benchmark::Median(one_by_one) / benchmark::Median(together), ""});
   add("adaptation, M = 10, N = 80", "ms", "adapt_ms", "adapt");
   add("meta-gradient of one task, second order", "ms", "maml_ms", "maml");
   add("meta-gradient of one task, first order", "ms", "fomaml_ms", "fomaml");

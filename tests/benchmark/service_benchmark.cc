@@ -21,10 +21,13 @@
 #include <vector>
 
 #include "core/base/executor.h"
+#include "core/nssm/model_file.h"
 #include "core/sim/simulate.h"
+#include "tests/benchmark/networks.h"
 #include "tests/benchmark/report.h"
 #include "tests/benchmark/streams.h"
 #include "tests/server/support/server_process.h"
+#include "tests/support/bundles.h"
 
 namespace metaekf::benchmark {
 namespace {
@@ -185,8 +188,32 @@ double ResidentKib(pid_t pid) {
   Fail("the server's memory cannot be read");
 }
 
-/// More and more sessions that take turns, as many messages in flight as before.
-std::vector<Row> Growth(const ServerProcess& server) {
+/// Of streams that take turns, as many messages in flight as ever.
+template <class Stream>
+double RateOfTurns(const std::vector<std::unique_ptr<Stream>>& streams) {
+  for (const auto& stream : streams) stream->Send(), stream->Receive();  // until everything is warm
+  std::vector<double> rates;
+  for (int round = 0; round < kRounds; ++round) {
+    size_t out = 0, in = 0;
+    rates.push_back(MessagesPerSecond(kMessagesInFlight, kSecondsPerRound, [&] { streams[out++ % streams.size()]->Send(); },
+                                      [&] { streams[in++ % streams.size()]->Receive(); }));
+  }
+  return Median(rates);
+}
+
+/// More and more sessions, and as many streams of the echo.
+std::vector<Row> Growth(const ServerProcess& server, const std::string& echo) {
+  std::vector<double> echoed;
+  {
+    std::vector<std::unique_ptr<EchoStream>> streams;
+    std::shared_ptr<grpc::Channel> connection;
+    for (const size_t sessions : kSessions) {
+      for (; streams.size() < sessions; streams.push_back(std::make_unique<EchoStream>(connection, SizesOf(1)))) {
+        if (streams.size() % kSessionsPerConnection == 0) connection = ConnectionTo(echo);
+      }
+      echoed.push_back(RateOfTurns(streams));
+    }
+  }
   std::vector<std::unique_ptr<client::Client>> connections;
   std::vector<std::unique_ptr<EstimateStream>> streams;
   std::vector<Row> rows;
@@ -203,21 +230,43 @@ std::vector<Row> Growth(const ServerProcess& server) {
       streams.push_back(std::make_unique<EstimateStream>(connections.back().get(), 1));
       opening_ms.push_back(1e3 * SecondsSince(begin));
     }
-    size_t next_out = 0, next_in = 0;
-    const auto turn = [&](size_t* next) { return streams[(*next)++ % streams.size()].get(); };
-    for (size_t i = 0; i < streams.size(); ++i) streams[i]->Send(), streams[i]->Receive();
+    const double rate = RateOfTurns(streams), peer = echoed[rows.size() / 3];
     const double kib = ResidentKib(server.pid());
-    std::vector<double> rates;
-    for (int round = 0; round < kRounds; ++round) {
-      rates.push_back(MessagesPerSecond(kMessagesInFlight, kSecondsPerRound, [&] { turn(&next_out)->Send(); }, [&] { turn(&next_in)->Receive(); }));
-      next_out = next_in = 0;
-    }
     const std::string of = std::to_string(sessions) + " sessions, ";
-    rows.push_back({of + "estimates", "1/s", Median(rates), kNaN, kNaN, ""});
+    rows.push_back({of + "estimates", "1/s", rate, peer, rate / peer, ""});
     rows.push_back({of + "opening one", "ms", Median(opening_ms), kNaN, kNaN, ""});
-    if (before > 0) rows.push_back({of + "server memory of each more", "KiB", (kib - before_kib) / static_cast<double>(sessions - before), kNaN, kNaN, ""});
+    rows.push_back({of + "server memory of each more", "KiB", before > 0 ? (kib - before_kib) / static_cast<double>(sessions - before) : kNaN, kNaN, kNaN, ""});
     before = sessions;
     before_kib = kib;
+  }
+  return rows;
+}
+
+/// A model of some 600,000 parameters with the channels of the oscillator.
+std::string LargeModel() {
+  nssm::ModelSpec spec = LocalisationSpec();
+  spec.input_size = 0;
+  spec.state_size = 2;
+  spec.curl_free_positions.clear();
+  nssm::Bundle bundle = support::UnitBundle(*nssm::Model::Create(spec));
+  bundle.parameters = bundle.model.InitialParameters(1);
+  nssm::RoundToPrecision(spec.precision, &bundle.parameters);
+  return nssm::WriteModelFile(bundle);
+}
+
+/// Sessions of a large model, each with one message in flight: waiting samples are applied together.
+std::vector<Row> Large(client::Client* client) {
+  std::vector<Row> rows;
+  std::vector<std::unique_ptr<EstimateStream>> streams;
+  for (const size_t sessions : {1, 4, 16}) {
+    while (streams.size() < sessions) streams.push_back(std::make_unique<EstimateStream>(client, 1, "large"));
+    std::vector<double> rates;
+    for (int round = 0; round < kRounds; ++round) {
+      size_t out = 0, in = 0;
+      rates.push_back(MessagesPerSecond(static_cast<int>(sessions), kSecondsPerRound, [&] { streams[out++ % sessions]->Send(); },
+                                        [&] { streams[in++ % sessions]->Receive(); }));
+    }
+    rows.push_back({std::to_string(sessions) + " sessions of one large model, estimates", "1/s", Median(rates), kNaN, kNaN, ""});
   }
   return rows;
 }
@@ -259,20 +308,23 @@ int Main(const std::string& only, const std::string& json) {
     Check(client.ImportModel("van-der-pol", ZooModel()).status(), "importing");
     report("Streams", [&] { return Throughput(&client, echo.address()); });
     report("Latency", [&] { return Latency(&client, echo.address()); });
+    Check(client.ImportModel("large", LargeModel()).status(), "importing");
+    report("Large", [&] { return Large(&client); });
     ours.End(SIGTERM);
     echo.End(SIGTERM);
   }
   report("Growth", [&] {
-    ServerProcess server = ServerProcess::Metaekfd((data / "growth").string());
+    ServerProcess server = ServerProcess::Metaekfd((data / "growth").string()), echo(METAEKF_ECHO_BINARY, {});
     client::Client client({.server = server.address()});
     Check(client.ImportModel("van-der-pol", ZooModel()).status(), "importing");
-    std::vector<Row> rows = Growth(server);
+    std::vector<Row> rows = Growth(server, echo.address());
     server.End(SIGTERM);
+    echo.End(SIGTERM);
     return rows;
   });
   report("Start", [&] { return Start((data / "start").string()); });
   std::filesystem::remove_all(data);
-  if (all.empty()) Fail("there is no table " + only + "; there are Streams, Latency, Growth and Start");
+  if (all.empty()) Fail("there is no table " + only + "; there are Streams, Latency, Large, Growth and Start");
   if (!json.empty() && !AddToJson(json, all)) Fail(json + " cannot be written");
   return 0;
 }

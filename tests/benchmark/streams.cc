@@ -105,8 +105,17 @@ Sizes SizesOf(int samples) {
   return {request.ByteSizeLong(), response.ByteSizeLong()};
 }
 
+std::shared_ptr<grpc::Channel> ConnectionTo(const std::string& address) {
+  grpc::ChannelArguments arguments;
+  arguments.SetInt(GRPC_ARG_USE_LOCAL_SUBCHANNEL_POOL, 1);
+  return grpc::CreateCustomChannel(address, grpc::InsecureChannelCredentials(), arguments);
+}
+
 EchoStream::EchoStream(const std::string& address, const Sizes& sizes)
-    : stub_(Echo::NewStub(grpc::CreateChannel(address, grpc::InsecureChannelCredentials()))), stream_(stub_->Stream(&context_)) {
+    : EchoStream(grpc::CreateChannel(address, grpc::InsecureChannelCredentials()), sizes) {}
+
+EchoStream::EchoStream(const std::shared_ptr<grpc::Channel>& channel, const Sizes& sizes)
+    : stub_(Echo::NewStub(channel)), stream_(stub_->Stream(&context_)) {
   // A payload's tag and length take two bytes up to 127, and as many the number of bytes in the reply.
   request_.mutable_payload()->resize(sizes.request > 4 ? sizes.request - 4 : 0);
   request_.set_reply_bytes(static_cast<uint32_t>(sizes.response - 2));

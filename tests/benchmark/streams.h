@@ -33,6 +33,7 @@ Sizes SizesOf(int samples);
 class EchoStream {
  public:
   EchoStream(const std::string& address, const Sizes& sizes);
+  EchoStream(const std::shared_ptr<grpc::Channel>& channel, const Sizes& sizes);
   ~EchoStream();
   void Send();
   void Receive();
@@ -44,6 +45,9 @@ class EchoStream {
   EchoRequest request_;
   EchoReply reply_;
 };
+
+/// A connection that no other channel shares.
+std::shared_ptr<grpc::Channel> ConnectionTo(const std::string& address);
 
 /// A stream of estimates of a van der Pol model.
 class EstimateStream {

@@ -2,6 +2,8 @@
 
 #include <cmath>
 #include <limits>
+#include <thread>
+#include <vector>
 
 #include "core/base/rng.h"
 #include "core/filter/ekf.h"
@@ -164,6 +166,23 @@ TEST_F(EstimationServiceTest, TheStreamEqualsTheFilterBitForBit) {
     ExpectIdentical(Run(call, recording, 1, 10000, per_message), direct);
     EXPECT_TRUE(End(call).ok());
   }
+}
+
+TEST_F(EstimationServiceTest, StreamsOfALargeModelAtTheSameTimeEqualTheFilterBitForBit) {
+  bundle_ = LargeStateBundle();
+  Import("large", *bundle_);
+  const Recording recording = MakeRecording(400, 0.05);
+  const Estimates direct = Direct(recording);
+  std::vector<std::thread> clients;
+  for (size_t client = 0; client < 10; ++client) {
+    clients.emplace_back([&, client] {
+      Call call = Start(OpenRequest("models/large"));
+      ReadOpened(call);
+      ExpectIdentical(Run(call, recording, 1, 400, client < 6 ? 1 : 7 * client), direct);
+      EXPECT_TRUE(End(call).ok());
+    });
+  }
+  for (std::thread& client : clients) client.join();
 }
 
 TEST_F(EstimationServiceTest, AResumedSessionGoesOnBitForBit) {

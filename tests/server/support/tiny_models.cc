@@ -33,6 +33,17 @@ nssm::Bundle MakeBundle(const v1::TrainingSpec& message, uint64_t seed) {
   return bundle;
 }
 
+v1::TrainingSpec StateSpec() {
+  v1::TrainingSpec spec;
+  v1::ModelSpec& model = *spec.mutable_model();
+  model.set_case_(v1::ModelSpec::STATE_INPUT_OUTPUT);
+  model.set_input_size(1);
+  model.set_output_size(1);
+  model.set_state_size(2);
+  model.set_latent_size(3);
+  return spec;
+}
+
 }  // namespace
 
 nssm::Bundle TinyBundle(uint64_t seed) {
@@ -42,14 +53,14 @@ nssm::Bundle TinyBundle(uint64_t seed) {
   return MakeBundle(spec, seed);
 }
 
-nssm::Bundle TinyStateBundle() {
-  v1::TrainingSpec spec;
+nssm::Bundle TinyStateBundle() { return MakeBundle(StateSpec(), 1); }
+
+nssm::Bundle LargeStateBundle() {
+  v1::TrainingSpec spec = StateSpec();
   v1::ModelSpec& model = *spec.mutable_model();
-  model.set_case_(v1::ModelSpec::STATE_INPUT_OUTPUT);
-  model.set_input_size(1);
-  model.set_output_size(1);
-  model.set_state_size(2);
-  model.set_latent_size(3);
+  for (v1::BlockSpec* block : {model.mutable_encoder(), model.mutable_transition()->mutable_block(), model.mutable_output_decoder()}) {
+    for (int layer = 0; layer < 2; ++layer) block->add_hidden_widths(128);
+  }
   return MakeBundle(spec, 1);
 }
 

@@ -14,6 +14,8 @@ namespace metaekf::server {
 nssm::Bundle TinyBundle(uint64_t seed = 1);
 /// Case II: one input, one output, two states.
 nssm::Bundle TinyStateBundle();
+/// The same with layers so wide that sessions are stepped together.
+nssm::Bundle LargeStateBundle();
 
 /// A specification for TinyFleet with the architecture of TinyBundle.
 v1::TrainingSpec TinySpec(uint32_t iterations);
