@@ -31,9 +31,12 @@ constexpr double kLargestMove = 2;       // of ln d²
 constexpr double kLeastShare = 0.2;      // of a move
 constexpr double kLargest = 30;          // |ln d²|: 10¹³
 constexpr double kLargestCorrelation = 1 - 1e-9;
-constexpr double kSearchWork = 16000;    // samples of one entry; a search over n entries takes some n^1.5 times as long
+constexpr double kSearchWork = 16000;    // samples of a run and one entry; a search over n entries takes some n^1.5 times as long
 constexpr Index kFewestSamples = 50;
+constexpr size_t kFewestRuns = 4;        // of a fleet: with fewer, halves say nothing
+constexpr double kHeld = 0.95, kWidth = 1.959964;  // of bounds, and how many deviations wide they are
 constexpr double kFailed = -std::numeric_limits<double>::infinity();
+constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 
 /// Where a scale acts: D_q, D_r, then of each bias its size and its time constant, then the deviation of the parameters.
 struct Layout {
@@ -145,8 +148,9 @@ struct Score {
   VectorXd squares;             ///< mean of errors squared in their ratio to their variances: of states in Case II, then of innovations
 };
 
+/// @param ratios  or null: receives errors in their ratio to their deviations, of states in Case II, else of innovations.
 Score ScoreOf(const nssm::Bundle& bundle, const nssm::FilterNoise& noise, const std::shared_ptr<const FilterModel>& model,
-              const Prepared& run) {
+              const Prepared& run, std::vector<double>* ratios = nullptr) {
   absl::StatusOr<Ekf> ekf = MakeFilter(bundle, noise, model, run);
   if (!ekf.ok()) return {};
   ekf->Restore(run.start);
@@ -165,11 +169,13 @@ Score ScoreOf(const nssm::Bundle& bundle, const nssm::FilterNoise& noise, const 
       sum += LogDensity(error / scale, estimate.cov(i, i) / (scale * scale));
       squares[i] += Tempered(error * error / estimate.cov(i, i));
       counts[i] += 1;
+      if (ratios != nullptr) ratios->push_back(std::fabs(error) / std::sqrt(estimate.cov(i, i)));
     }
     for (Index i = 0; i < outputs; ++i) {
       if (std::isnan(estimate.innovation[i])) continue;
       squares[states + i] += Tempered(estimate.innovation[i] * estimate.innovation[i] / estimate.innovation_cov(i, i));
       counts[states + i] += 1;
+      if (ratios != nullptr && states == 0) ratios->push_back(std::fabs(estimate.innovation[i]) / std::sqrt(estimate.innovation_cov(i, i)));
     }
     ++samples;
   }
@@ -226,29 +232,37 @@ Score ScoreOfAll(const nssm::Bundle& bundle, const nssm::FilterNoise& noise, con
   return total;
 }
 
-}  // namespace
-
-CalibrationRun RunOf(const nssm::Bundle& adapted, data::Trajectory trajectory) {
-  return {adapted.parameters, UnknownDirections(adapted), std::move(trajectory)};
+/// δ̂ of Calibrate, from every system's v.
+double ExcessOfNewSystems(const std::vector<double>& known, const std::vector<double>& fresh) {
+  if (known.empty() || fresh.size() < 2) return 0;
+  std::vector<double> all = known;
+  all.insert(all.end(), fresh.begin(), fresh.end());
+  const auto mean = [](const std::vector<double>& v) { return Eigen::Map<const VectorXd>(v.data(), static_cast<Index>(v.size())).mean(); };
+  const auto squares = [&](const std::vector<double>& v) {
+    return (Eigen::Map<const VectorXd>(v.data(), static_cast<Index>(v.size())).array() - mean(v)).square().sum();
+  };
+  const double difference = mean(fresh) - mean(all);
+  const double n = static_cast<double>(all.size()), n_fresh = static_cast<double>(fresh.size());
+  // Within each kind; the difference of a part's mean from that of the whole.
+  const double variance = (squares(known) + squares(fresh)) / std::max(1.0, n - 2) * (1 / n_fresh - 1 / n);
+  if (difference == 0 || variance >= difference * difference) return 0;
+  return (1 - variance / (difference * difference)) * difference;
 }
 
-double LogLikelihood(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, base::Executor* executor) {
-  const std::shared_ptr<const FilterModel> model = FilterModel::Create(bundle);
-  const absl::StatusOr<std::vector<Prepared>> prepared = PrepareAll(bundle, model, runs);
-  return prepared.ok() ? ScoreOfAll(bundle, bundle.noise, model, *prepared, executor).likelihood : kFailed;
+/// All of Q, R, what lasts, and what is not known of parameters.
+nssm::FilterNoise AllScaled(nssm::FilterNoise noise, double log_variance) {
+  noise.process *= std::exp(log_variance);
+  noise.measurement *= std::exp(log_variance);
+  noise.process_bias = Scaled(std::move(noise.process_bias), log_variance, 0);
+  noise.measurement_bias = Scaled(std::move(noise.measurement_bias), log_variance, 0);
+  noise.parameter_std *= std::exp(0.5 * log_variance);
+  return noise;
 }
 
-nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, double log_std, base::Executor* executor) {
-  if (log_std == 0) return bundle.noise;
-  const std::shared_ptr<const FilterModel> model = FilterModel::Create(bundle);
-  const absl::StatusOr<std::vector<Prepared>> prepared = PrepareAll(bundle, model, runs);
-  if (!prepared.ok()) return bundle.noise;
+/// ln d², with which filters explain the runs best: steps 1 to 4 of Calibrate.
+VectorXd MostLikelyScales(const nssm::Bundle& bundle, const std::shared_ptr<const FilterModel>& model, const Layout& layout,
+                          const std::vector<Prepared>& runs, double log_std, base::Executor* executor) {
   const bool fleet = std::isinf(log_std);
-  const Layout layout{.process = bundle.model.spec().is_case_one() ? 1 : bundle.noise.process.rows(),
-                      .measurement = bundle.noise.measurement.rows(),
-                      .process_bias = bundle.noise.process_bias.loadings.cols() > 0,
-                      .measurement_bias = bundle.noise.measurement_bias.loadings.cols() > 0,
-                      .parameters = fleet && std::any_of(runs.begin(), runs.end(), [](const CalibrationRun& run) { return run.directions.cols() > 0; })};
   const auto score = [&](const std::vector<Prepared>& of, const VectorXd& log_scales) {
     if (log_scales.lpNorm<Eigen::Infinity>() > kLargest) return Score();
     Score found = ScoreOfAll(bundle, Scaled(bundle.noise, log_scales, layout), model, of, executor);
@@ -274,11 +288,11 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
     }
   };
   // A filter that has lost track tells nothing of where it would keep it: first in great steps to where all do.
-  for (double at = score(*prepared, best).likelihood, before = kFailed; fleet && at > before + kWorthwhile;) {
+  for (double at = score(runs, best).likelihood, before = kFailed; fleet && at > before + kWorthwhile;) {
     before = at;
     for (const VectorXd& together : Together(layout)) {
       for (const double step : {kLargestMove, -kLargestMove}) {
-        const double trial = score(*prepared, best + step * together).likelihood;
+        const double trial = score(runs, best + step * together).likelihood;
         if (!(trial > at + kWorthwhile)) continue;
         best += step * together;
         at = trial;
@@ -286,8 +300,8 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
       }
     }
   }
-  match_errors(*prepared);
-  const std::vector<Prepared> beginnings = FirstOf(*prepared, SearchSamples(layout));
+  match_errors(runs);
+  const std::vector<Prepared> beginnings = FirstOf(runs, SearchSamples(layout));
   const auto objective = [&](const VectorXd& log_scales) { return score(beginnings, log_scales).likelihood; };
   double value = objective(best);
   const auto improve = [&](const VectorXd& move) {
@@ -310,8 +324,80 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
     improve(move);
   }
   // Beginnings do not know of errors that take long to grow.
-  if (beginnings.front().end < prepared->front().end) match_errors(*prepared);
-  return Scaled(bundle.noise, best, layout);
+  if (beginnings.front().end < runs.front().end) match_errors(runs);
+  return best;
+}
+
+/// ln of the square of the factor by which bounds must widen to hold what they say. @param ratios  of errors to deviations; not empty.
+double LogWidening(std::vector<double> ratios) {
+  const auto within = ratios.begin() + static_cast<ptrdiff_t>(kHeld * static_cast<double>(ratios.size() - 1));
+  std::nth_element(ratios.begin(), within, ratios.end());
+  const double widening = 2 * std::log(*within / kWidth);
+  return std::isfinite(widening) ? std::clamp(widening, -kLargestMove, kLargestMove) : 0;
+}
+
+/// w of Calibrate, its steps 5 and 6. @param of_half  noise that each half of the runs, every other one, has led to.
+double Widening(const nssm::Bundle& bundle, const std::array<nssm::FilterNoise, 2>& of_half, const std::shared_ptr<const FilterModel>& model,
+                const std::vector<CalibrationRun>& runs, const std::vector<Prepared>& prepared, base::Executor* executor) {
+  std::vector<Score> scores(runs.size());
+  std::vector<std::vector<double>> ratios(runs.size());
+  executor->ParallelFor(runs.size(), [&](size_t i, size_t) { scores[i] = ScoreOf(bundle, of_half[1 - i % 2], model, prepared[i], &ratios[i]); });
+  double widening = 0;
+  std::vector<double> known, fresh;
+  for (size_t half = 0; half < 2; ++half) {
+    std::vector<double> all, sizes;
+    std::vector<bool> trained_on;
+    for (size_t i = half; i < runs.size(); i += 2) {
+      const double size = scores[i].likelihood > kFailed ? std::log(scores[i].squares.mean()) : kNaN;
+      if (!std::isfinite(size)) continue;  // where a filter would have to be begun anew no width helps
+      sizes.push_back(size);
+      trained_on.push_back(runs[i].trained_on);
+      all.insert(all.end(), ratios[i].begin(), ratios[i].end());
+    }
+    if (all.empty()) return 0;
+    const double of_this = LogWidening(std::move(all));
+    widening += 0.5 * of_this;
+    for (size_t i = 0; i < sizes.size(); ++i) (trained_on[i] ? known : fresh).push_back(sizes[i] - of_this);
+  }
+  // Innovations are as large as likelihood has made their covariance: that more of them are small is no reason to take it back.
+  if (bundle.model.spec().is_case_one()) widening = std::max(widening, 0.0);
+  return widening + ExcessOfNewSystems(known, fresh);
+}
+
+}  // namespace
+
+CalibrationRun RunOf(const nssm::Bundle& adapted, data::Trajectory trajectory) {
+  return {adapted.parameters, UnknownDirections(adapted), std::move(trajectory)};
+}
+
+double LogLikelihood(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, base::Executor* executor) {
+  const std::shared_ptr<const FilterModel> model = FilterModel::Create(bundle);
+  const absl::StatusOr<std::vector<Prepared>> prepared = PrepareAll(bundle, model, runs);
+  return prepared.ok() ? ScoreOfAll(bundle, bundle.noise, model, *prepared, executor).likelihood : kFailed;
+}
+
+nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, double log_std, base::Executor* executor) {
+  if (log_std == 0) return bundle.noise;
+  const std::shared_ptr<const FilterModel> model = FilterModel::Create(bundle);
+  const absl::StatusOr<std::vector<Prepared>> prepared = PrepareAll(bundle, model, runs);
+  if (!prepared.ok()) return bundle.noise;
+  const bool fleet = std::isinf(log_std);
+  const Layout layout{.process = bundle.model.spec().is_case_one() ? 1 : bundle.noise.process.rows(),
+                      .measurement = bundle.noise.measurement.rows(),
+                      .process_bias = bundle.noise.process_bias.loadings.cols() > 0,
+                      .measurement_bias = bundle.noise.measurement_bias.loadings.cols() > 0,
+                      .parameters = fleet && std::any_of(runs.begin(), runs.end(), [](const CalibrationRun& run) { return run.directions.cols() > 0; })};
+  if (!fleet || runs.size() < kFewestRuns) return Scaled(bundle.noise, MostLikelyScales(bundle, model, layout, *prepared, log_std, executor), layout);
+  std::array<std::vector<Prepared>, 2> halves;
+  for (size_t i = 0; i < runs.size(); ++i) halves[i % 2].push_back((*prepared)[i]);
+  std::array<VectorXd, 2> scales;
+  std::array<nssm::FilterNoise, 2> of_half;
+  for (size_t half = 0; half < 2; ++half) {
+    scales[half] = MostLikelyScales(bundle, model, layout, halves[half], log_std, executor);
+    of_half[half] = Scaled(bundle.noise, scales[half], layout);
+  }
+  const nssm::FilterNoise noise = Scaled(bundle.noise, 0.5 * (scales[0] + scales[1]), layout);
+  return AllScaled(noise, Widening(bundle, of_half, model, runs, *prepared, executor));
 }
 
 }  // namespace metaekf::filter

@@ -24,7 +24,17 @@ using data::Trajectory;
 using nssm::Bundle;
 using nssm::ModelSpec;
 
-constexpr size_t kNoiseSystems = 8;    // systems whose residuals give the default covariances, at most
+/// Systems whose filters give the default covariances: those held out, then of a fleet that is not known by heart those trained on. The more
+/// the better, but each takes time that grows with the size of the state.
+std::vector<size_t> Judges(const ModelSpec& model, const data::Split& split) {
+  constexpr size_t kFleet = 10;
+  constexpr int32_t kFewest = 8, kMost = 80, kWork = 240;
+  std::vector<size_t> judges = split.validation;
+  if (judges.empty() || split.training.size() + split.validation.size() >= kFleet) judges.insert(judges.end(), split.training.begin(), split.training.end());
+  const int32_t most = std::clamp(kWork / std::max(model.is_case_one() ? model.latent_size : model.state_size, 1), kFewest, kMost);
+  judges.resize(std::min(judges.size(), static_cast<size_t>(most)));
+  return judges;
+}
 
 /// Takes what the spec leaves open from the data, and refuses data that does not fit it.
 absl::Status FitSpecToData(const Dataset& fleet, TrainingSpec* spec) {
@@ -91,9 +101,9 @@ absl::StatusOr<LearnedStart> SharedParameters(const TrainingSpec& spec, const ns
   return learned;
 }
 
-/// What a filter of a system is calibrated on: at most so many samples behind its context, or all of a recording that is hardly longer
-/// than that.
-constexpr int64_t kCalibrationSamples = 2000, kFewSamples = 50;
+/// What a filter of a system is calibrated on: at most so many samples behind its context, and of all systems together, or all of a
+/// recording that is hardly longer than that.
+constexpr int64_t kCalibrationSamples = 2000, kAllCalibrationSamples = 48'000, kFewSamples = 50;
 constexpr double kLogStds[] = {0, 0.25, 0.5, 1, 2};
 
 /// How far systems' own Q and R are from the fleet's (FilterNoise::log_std): with which of kLogStds what the tails of contexts say
@@ -123,8 +133,9 @@ double OwnNoise(const Bundle& bundle, const AdaptationOptions& options, const st
 
 /// Default Q, R and P₀ from the residuals of the model adapted to each of `systems`, Q and R scaled to what filters of these systems
 /// meet after the context (filter::Calibrate), and how far from them a system's own may be.
+/// @param held_out  so many of them, the first, have not been trained on.
 absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const TrainingSpec& spec,
-                                                       const std::vector<Trajectory>& systems, base::Executor* executor) {
+                                                       const std::vector<Trajectory>& systems, size_t held_out, base::Executor* executor) {
   METAEKF_ASSIGN_OR_RETURN(const AdaptationOptions options, DefaultAdaptation(bundle));
   const int64_t wanted = std::max<int64_t>(spec.context_samples, ContextSamplesNeeded(spec.model, spec.loss));
   std::vector<std::optional<Bundle>> adapted(systems.size());
@@ -134,6 +145,7 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const Trai
     // An adaptation that diverges says nothing about noise; the unadapted model stands in.
     adapted[i] = found.ok() ? *std::move(found) : bundle;
   });
+  const int64_t most = std::min(kCalibrationSamples, kAllCalibrationSamples / static_cast<int64_t>(systems.size()));
   filter::NoiseEstimate noise(bundle);
   std::vector<filter::CalibrationRun> runs, later_runs;
   std::vector<Trajectory> contexts;  // of the later runs
@@ -142,8 +154,9 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const Trai
     noise.Add(adapted[i]->parameters, normalised);
     const int64_t begin = systems[i].length() - wanted < kFewSamples ? 0 : wanted;
     METAEKF_ASSIGN_OR_RETURN(const Trajectory later, data::SamplesFrom(systems[i], begin));
-    METAEKF_ASSIGN_OR_RETURN(Trajectory run, data::FirstSamples(later, std::min(later.length(), kCalibrationSamples)));
+    METAEKF_ASSIGN_OR_RETURN(Trajectory run, data::FirstSamples(later, std::min(later.length(), most)));
     runs.push_back(filter::RunOf(*adapted[i], std::move(run)));
+    runs.back().trained_on = i >= held_out;
     if (begin == 0) continue;
     METAEKF_ASSIGN_OR_RETURN(Trajectory context, data::FirstSamples(systems[i], wanted));
     contexts.push_back(std::move(context));
@@ -225,9 +238,7 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
   bundle.training = ToJson(spec);
   bundle.provenance = {{"systems", fleet.trajectories.size()}, {"iterations", state.iteration}};
   if (std::isfinite(state.best_validation_loss)) bundle.provenance["validation_loss"] = state.best_validation_loss;
-  std::vector<size_t> judges = systems.validation.empty() ? split.training : split.validation;
-  if (judges.size() > kNoiseSystems) judges.resize(kNoiseSystems);
-  METAEKF_ASSIGN_OR_RETURN(bundle.noise, NoiseOfAdaptedModels(bundle, spec, Pick(used.trajectories, judges), executor));
+  METAEKF_ASSIGN_OR_RETURN(bundle.noise, NoiseOfAdaptedModels(bundle, spec, Pick(used.trajectories, Judges(spec.model, split)), split.validation.size(), executor));
   return bundle;
 }
 
