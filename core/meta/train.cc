@@ -24,13 +24,15 @@ using data::Trajectory;
 using nssm::Bundle;
 using nssm::ModelSpec;
 
-/// Systems whose filters give the default covariances: those held out, then of a fleet that is not known by heart those trained on. The more
-/// the better, but each takes time that grows with the size of the state.
-std::vector<size_t> Judges(const ModelSpec& model, const data::Split& split) {
+/// Systems whose filters give the default covariances: those held out, then those trained on, unless they are known by heart, as those of a
+/// small fleet and those whose fits a prior has among its examples. The more the better, but each takes time that grows with the size of the state.
+std::vector<size_t> Judges(const TrainingSpec& spec, const data::Split& split) {
   constexpr size_t kFleet = 10;
+  const ModelSpec& model = spec.model;
   constexpr int32_t kFewest = 8, kMost = 80, kWork = 240;
   std::vector<size_t> judges = split.validation;
-  if (judges.empty() || split.training.size() + split.validation.size() >= kFleet) judges.insert(judges.end(), split.training.begin(), split.training.end());
+  const bool by_heart = spec.algorithm == Algorithm::kGaussianPrior || split.training.size() + split.validation.size() < kFleet;
+  if (judges.empty() || !by_heart) judges.insert(judges.end(), split.training.begin(), split.training.end());
   const int32_t most = std::clamp(kWork / std::max(model.is_case_one() ? model.latent_size : model.state_size, 1), kFewest, kMost);
   judges.resize(std::min(judges.size(), static_cast<size_t>(most)));
   return judges;
@@ -238,7 +240,7 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
   bundle.training = ToJson(spec);
   bundle.provenance = {{"systems", fleet.trajectories.size()}, {"iterations", state.iteration}};
   if (std::isfinite(state.best_validation_loss)) bundle.provenance["validation_loss"] = state.best_validation_loss;
-  METAEKF_ASSIGN_OR_RETURN(bundle.noise, NoiseOfAdaptedModels(bundle, spec, Pick(used.trajectories, Judges(spec.model, split)), split.validation.size(), executor));
+  METAEKF_ASSIGN_OR_RETURN(bundle.noise, NoiseOfAdaptedModels(bundle, spec, Pick(used.trajectories, Judges(spec, split)), split.validation.size(), executor));
   return bundle;
 }
 
