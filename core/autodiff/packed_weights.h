@@ -25,8 +25,6 @@ class PackedWeights {
   /// The same without factors of which elements `changed` says so: of a run whose weights are others there.
   /// @param changed  one flag for each element of the slot.
   Packed<T> Without(size_t user, const std::vector<bool>& changed) const;
-  /// Whether anything is packed.
-  bool empty() const { return factors_.empty(); }
 
  private:
   /// offset in the slot, ld, rows and columns as they lie, transposed or not
