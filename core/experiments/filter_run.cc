@@ -7,6 +7,7 @@
 #include "core/base/status.h"
 #include "core/data/split.h"
 #include "core/experiments/jobs.h"
+#include "core/filter/draw.h"
 #include "core/meta/adapt.h"
 
 namespace metaekf::experiments {
@@ -26,10 +27,12 @@ absl::StatusOr<nssm::Bundle> AdaptForFilter(const nssm::Bundle& model, const dat
   return adapted;
 }
 
-absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,
-                                             const data::Trajectory& recording, int64_t from, filter::FilterOptions options) {
+namespace {
+
+/// A filter that the samples before `from` have brought to where FilterAfterContext begins.
+absl::StatusOr<filter::Ekf> FilterBefore(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,
+                                         const data::Trajectory& recording, int64_t from, filter::FilterOptions options, filter::FilterModel::Scratch* scratch) {
   const std::shared_ptr<const filter::FilterModel::Parameters> parameters = functions->Prepare(model);
-  const std::unique_ptr<filter::FilterModel::Scratch> scratch = functions->MakeScratch();
   const data::Normaliser& units = model.normaliser;
   const bool case_one = model.model.spec().is_case_one();
   if (!case_one) {
@@ -37,7 +40,7 @@ absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const st
     VectorXd first(states);
     MatrixXd F(states, states);
     functions->Transition(*parameters, units.states.Normalise(recording.states.col(from - 1)),
-                          units.inputs.Normalise(recording.inputs.col(from - 1)), &first, &F, scratch.get());
+                          units.inputs.Normalise(recording.inputs.col(from - 1)), &first, &F, scratch);
     options.initial_mean = first.cwiseProduct(units.states.scale) + units.states.mean;
     const MatrixXd& W = model.noise.process_bias.loadings;
     options.initial_cov = options.process_cov ? *options.process_cov : MatrixXd(model.noise.process);
@@ -45,10 +48,20 @@ absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const st
   }
   METAEKF_ASSIGN_OR_RETURN(filter::Ekf ekf, filter::Ekf::Create(model, functions, parameters, options));
   filter::Estimate estimate = ekf.MakeEstimate();
-  const Index n = estimate.mean.size(), count = recording.length() - from;
   for (Index t = case_one ? std::max<Index>(0, from - model.model.spec().warmup()) : from; t < from; ++t) {
-    METAEKF_RETURN_IF_ERROR(ekf.Step(recording.inputs.col(t), recording.outputs.col(t), scratch.get(), &estimate));
+    METAEKF_RETURN_IF_ERROR(ekf.Step(recording.inputs.col(t), recording.outputs.col(t), scratch, &estimate));
   }
+  return ekf;
+}
+
+}  // namespace
+
+absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,
+                                             const data::Trajectory& recording, int64_t from, filter::FilterOptions options) {
+  const std::unique_ptr<filter::FilterModel::Scratch> scratch = functions->MakeScratch();
+  METAEKF_ASSIGN_OR_RETURN(filter::Ekf ekf, FilterBefore(model, functions, recording, from, std::move(options), scratch.get()));
+  filter::Estimate estimate = ekf.MakeEstimate();
+  const Index n = estimate.mean.size(), count = recording.length() - from;
   FilterRun run{.means = MatrixXd(n, count), .deviations = MatrixXd(n, count), .nis = VectorXd(count), .projection = VectorXd(count)};
   const double begin = ThreadSeconds();
   for (Index t = 0; t < count; ++t) {
@@ -61,6 +74,21 @@ absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const st
   }
   run.seconds_per_step = (ThreadSeconds() - begin) / static_cast<double>(count);
   return run;
+}
+
+absl::StatusOr<data::Trajectory> AsFilterBelieves(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,
+                                                  data::Trajectory recording, int64_t from, base::Rng* rng) {
+  const std::unique_ptr<filter::FilterModel::Scratch> scratch = functions->MakeScratch();
+  METAEKF_ASSIGN_OR_RETURN(filter::Ekf ekf, FilterBefore(model, functions, recording, from, {}, scratch.get()));
+  filter::Estimate estimate = ekf.MakeEstimate();
+  METAEKF_RETURN_IF_ERROR(ekf.Step(recording.inputs.col(from), recording.outputs.col(from), scratch.get(), &estimate));
+  const Index rest = recording.length() - from - 1;
+  METAEKF_ASSIGN_OR_RETURN(const filter::Future future, filter::Draw(ekf, recording.inputs.rightCols(rest), rng, scratch.get()));
+  if (model.model.spec().is_case_one()) recording.states = recording.outputs;
+  recording.states.col(from) = future.now;
+  recording.states.rightCols(rest) = future.truth;
+  recording.outputs.rightCols(rest) = future.outputs;
+  return recording;
 }
 
 double Coverage(const FilterRun& run, const MatrixXd& errors, double width) {

@@ -245,18 +245,8 @@ double ExcessOfNewSystems(const std::vector<double>& known, const std::vector<do
   const double n = static_cast<double>(all.size()), n_fresh = static_cast<double>(fresh.size());
   // Within each kind; the difference of a part's mean from that of the whole.
   const double variance = (squares(known) + squares(fresh)) / std::max(1.0, n - 2) * (1 / n_fresh - 1 / n);
-  if (difference == 0 || variance >= difference * difference) return 0;
+  if (difference <= 0 || variance >= difference * difference) return 0;  // a model follows no new system better than those that it knows
   return (1 - variance / (difference * difference)) * difference;
-}
-
-/// All of Q, R, what lasts, and what is not known of parameters.
-nssm::FilterNoise AllScaled(nssm::FilterNoise noise, double log_variance) {
-  noise.process *= std::exp(log_variance);
-  noise.measurement *= std::exp(log_variance);
-  noise.process_bias = Scaled(std::move(noise.process_bias), log_variance, 0);
-  noise.measurement_bias = Scaled(std::move(noise.measurement_bias), log_variance, 0);
-  noise.parameter_std *= std::exp(0.5 * log_variance);
-  return noise;
 }
 
 /// ln d², with which filters explain the runs best: steps 1 to 4 of Calibrate.
@@ -328,37 +318,37 @@ VectorXd MostLikelyScales(const nssm::Bundle& bundle, const std::shared_ptr<cons
   return best;
 }
 
-/// ln of the square of the factor by which bounds must widen to hold what they say. @param ratios  of errors to deviations; not empty.
-double LogWidening(std::vector<double> ratios) {
-  const auto within = ratios.begin() + static_cast<ptrdiff_t>(kHeld * static_cast<double>(ratios.size() - 1));
-  std::nth_element(ratios.begin(), within, ratios.end());
-  const double widening = 2 * std::log(*within / kWidth);
-  return std::isfinite(widening) ? std::clamp(widening, -kLargestMove, kLargestMove) : 0;
-}
+/// Runs, by their indices, and noise that does not come from them.
+struct Judged {
+  std::vector<size_t> runs;
+  nssm::FilterNoise noise;
+};
 
-/// w of Calibrate, its steps 5 and 6. @param of_half  noise that each half of the runs, every other one, has led to.
-double Widening(const nssm::Bundle& bundle, const std::array<nssm::FilterNoise, 2>& of_half, const std::shared_ptr<const FilterModel>& model,
+/// w of Calibrate, its steps 5 and 6.
+double Widening(const nssm::Bundle& bundle, const std::vector<Judged>& parts, const std::shared_ptr<const FilterModel>& model,
                 const std::vector<CalibrationRun>& runs, const std::vector<Prepared>& prepared, base::Executor* executor) {
-  std::vector<Score> scores(runs.size());
-  std::vector<std::vector<double>> ratios(runs.size());
-  executor->ParallelFor(runs.size(), [&](size_t i, size_t) { scores[i] = ScoreOf(bundle, of_half[1 - i % 2], model, prepared[i], &ratios[i]); });
-  double widening = 0;
+  double widening = 0, systems = 0;
   std::vector<double> known, fresh;
-  for (size_t half = 0; half < 2; ++half) {
+  for (const Judged& part : parts) {
+    std::vector<Score> scores(part.runs.size());
+    std::vector<std::vector<double>> ratios(part.runs.size());
+    executor->ParallelFor(part.runs.size(), [&](size_t i, size_t) { scores[i] = ScoreOf(bundle, part.noise, model, prepared[part.runs[i]], &ratios[i]); });
     std::vector<double> all, sizes;
     std::vector<bool> trained_on;
-    for (size_t i = half; i < runs.size(); i += 2) {
+    for (size_t i = 0; i < part.runs.size(); ++i) {
       const double size = scores[i].likelihood > kFailed ? std::log(scores[i].squares.mean()) : kNaN;
       if (!std::isfinite(size)) continue;  // where a filter would have to be begun anew no width helps
       sizes.push_back(size);
-      trained_on.push_back(runs[i].trained_on);
+      trained_on.push_back(runs[part.runs[i]].trained_on);
       all.insert(all.end(), ratios[i].begin(), ratios[i].end());
     }
-    if (all.empty()) return 0;
-    const double of_this = LogWidening(std::move(all));
-    widening += 0.5 * of_this;
-    for (size_t i = 0; i < sizes.size(); ++i) (trained_on[i] ? known : fresh).push_back(sizes[i] - of_this);
+    const double of_part = LogWidening(std::move(all));
+    widening += static_cast<double>(sizes.size()) * of_part;
+    systems += static_cast<double>(sizes.size());
+    for (size_t i = 0; i < sizes.size(); ++i) (trained_on[i] ? known : fresh).push_back(sizes[i] - of_part);
   }
+  if (systems == 0) return 0;
+  widening /= systems;
   // Innovations are as large as likelihood has made their covariance: that more of them are small is no reason to take it back.
   if (bundle.model.spec().is_case_one()) widening = std::max(widening, 0.0);
   return widening + ExcessOfNewSystems(known, fresh);
@@ -370,10 +360,36 @@ CalibrationRun RunOf(const nssm::Bundle& adapted, data::Trajectory trajectory) {
   return {adapted.parameters, UnknownDirections(adapted), std::move(trajectory)};
 }
 
-double LogLikelihood(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, base::Executor* executor) {
+double LogWidening(std::vector<double> ratios) {
+  if (ratios.empty()) return 0;
+  const auto within = ratios.begin() + static_cast<ptrdiff_t>(kHeld * static_cast<double>(ratios.size() - 1));
+  std::nth_element(ratios.begin(), within, ratios.end());
+  const double widening = 2 * std::log(*within / kWidth);
+  return std::isfinite(widening) ? std::clamp(widening, -kLargestMove, kLargestMove) : 0;
+}
+
+nssm::FilterNoise Widened(nssm::FilterNoise noise, double log_widening) {
+  noise.process *= std::exp(log_widening);
+  noise.measurement *= std::exp(log_widening);
+  noise.process_bias = Scaled(std::move(noise.process_bias), log_widening, 0);
+  noise.measurement_bias = Scaled(std::move(noise.measurement_bias), log_widening, 0);
+  noise.parameter_std *= std::exp(0.5 * log_widening);
+  return noise;
+}
+
+Explanation Explain(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, base::Executor* executor) {
   const std::shared_ptr<const FilterModel> model = FilterModel::Create(bundle);
   const absl::StatusOr<std::vector<Prepared>> prepared = PrepareAll(bundle, model, runs);
-  return prepared.ok() ? ScoreOfAll(bundle, bundle.noise, model, *prepared, executor).likelihood : kFailed;
+  if (!prepared.ok()) return {kFailed, {}};
+  std::vector<Score> scores(runs.size());
+  std::vector<std::vector<double>> ratios(runs.size());
+  executor->ParallelFor(runs.size(), [&](size_t i, size_t) { scores[i] = ScoreOf(bundle, bundle.noise, model, (*prepared)[i], &ratios[i]); });
+  Explanation explanation;
+  for (size_t i = 0; i < runs.size(); ++i) {
+    explanation.likelihood += scores[i].likelihood / static_cast<double>(runs.size());
+    if (scores[i].likelihood > kFailed) explanation.ratios.insert(explanation.ratios.end(), ratios[i].begin(), ratios[i].end());
+  }
+  return explanation;
 }
 
 nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, double log_std, base::Executor* executor) {
@@ -387,17 +403,24 @@ nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<Calibr
                       .process_bias = bundle.noise.process_bias.loadings.cols() > 0,
                       .measurement_bias = bundle.noise.measurement_bias.loadings.cols() > 0,
                       .parameters = fleet && std::any_of(runs.begin(), runs.end(), [](const CalibrationRun& run) { return run.directions.cols() > 0; })};
-  if (!fleet || runs.size() < kFewestRuns) return Scaled(bundle.noise, MostLikelyScales(bundle, model, layout, *prepared, log_std, executor), layout);
-  std::array<std::vector<Prepared>, 2> halves;
-  for (size_t i = 0; i < runs.size(); ++i) halves[i % 2].push_back((*prepared)[i]);
-  std::array<VectorXd, 2> scales;
-  std::array<nssm::FilterNoise, 2> of_half;
-  for (size_t half = 0; half < 2; ++half) {
-    scales[half] = MostLikelyScales(bundle, model, layout, halves[half], log_std, executor);
-    of_half[half] = Scaled(bundle.noise, scales[half], layout);
+  std::array<std::vector<size_t>, 2> halves;
+  std::vector<size_t> rest;
+  for (size_t i = 0; i < runs.size(); ++i) {
+    (runs[i].width_only ? rest : halves[halves[0].size() > halves[1].size() ? 1 : 0]).push_back(i);
   }
+  const auto most_likely = [&](const std::vector<size_t>& indices) {
+    std::vector<Prepared> picked;
+    for (const size_t i : indices) picked.push_back((*prepared)[i]);
+    return MostLikelyScales(bundle, model, layout, picked, log_std, executor);
+  };
+  if (!fleet || halves[0].size() + halves[1].size() < kFewestRuns) {
+    halves[0].insert(halves[0].end(), halves[1].begin(), halves[1].end());
+    return Scaled(bundle.noise, most_likely(halves[0]), layout);
+  }
+  const std::array<VectorXd, 2> scales = {most_likely(halves[0]), most_likely(halves[1])};
   const nssm::FilterNoise noise = Scaled(bundle.noise, 0.5 * (scales[0] + scales[1]), layout);
-  return AllScaled(noise, Widening(bundle, of_half, model, runs, *prepared, executor));
+  const std::vector<Judged> parts = {{halves[0], Scaled(bundle.noise, scales[1], layout)}, {halves[1], Scaled(bundle.noise, scales[0], layout)}, {rest, noise}};
+  return Widened(noise, Widening(bundle, parts, model, runs, *prepared, executor));
 }
 
 }  // namespace metaekf::filter

@@ -15,6 +15,7 @@ struct CalibrationRun {
   data::Trajectory trajectory;  ///< physical units; Case II with states
   /// Whether the fleet's model has been trained on the system: it may know such a system better than a new one.
   bool trained_on = false;
+  bool width_only = false;  ///< it says only how wide bounds must be, for which one filter does
 };
 
 /// Of a system that `adapted` has been adapted to.
@@ -40,11 +41,12 @@ CalibrationRun RunOf(const nssm::Bundle& adapted, data::Trajectory trajectory);
 ///      less than 1e-3 a number, of a fleet six times and else twice at most, on the beginnings of recordings alone where there are many numbers;
 ///   4. where these were only beginnings, 2 once more: some errors take long to grow;
 ///   5. of a fleet, all this on each half of the runs, every other one; the geometric mean of what both give is widened, Q ← e^w Q and so on,
-///      with w the mean of what it takes until bounds of 95 % hold 95 % of one half's errors (of states in Case II, else innovations) by the
-///      noise of the other, w ≥ 0 for innovations: likelihood tempers the errors of the few systems that a model does not follow well, bounds must not;
+///      with w the mean over systems of what it takes until bounds of 95 % hold 95 % of their errors (of states in Case II, else innovations):
+///      those of one half by the noise of the other, those of runs that are only for this by the mean of both. w ≥ 0 for innovations. Likelihood
+///      tempers the errors of the few systems that a model does not follow well, bounds must not;
 ///   6. where the model has been trained on some of the systems, w is δ̂ more: with v_i = ln of the mean square of system i's errors in
 ///      their ratio to what was expected, δ = mean of v over the systems not trained on − mean over all, ε its standard error, and
-///      δ̂ = max(0, 1 − ε²/δ²) δ (James and Stein): what may well be chance is not taken for a difference.
+///      δ̂ = max(0, 1 − ε²/δ²) δ (James and Stein), 0 for δ < 0: what may well be chance is not taken for a difference.
 ///
 /// How well bounds hold on new systems differs from fleet to fleet as much as its systems do among each other, so that many systems matter:
 /// 8, 16 and 80 held-out vehicles of localization gave bounds of 95 % that held 82, 90 and 92 % on new ones, without step 5.
@@ -56,8 +58,17 @@ CalibrationRun RunOf(const nssm::Bundle& adapted, data::Trajectory trajectory);
 /// Source: maximum likelihood of innovations, e.g. R. K. Mehra, IEEE Trans. Autom. Control 15 (1970) 175; the scaling is ours.
 nssm::FilterNoise Calibrate(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, double log_std, base::Executor* executor);
 
-/// How well filters with the bundle's noise explain recordings: what Calibrate makes largest, without its prior.
-/// @return per sample, mean over runs; −∞ where a filter does not stay finite.
-double LogLikelihood(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, base::Executor* executor);
+/// How filters with a bundle's noise explain recordings.
+struct Explanation {
+  double likelihood = 0;       ///< what Calibrate makes largest, without its prior, per sample, mean over runs; −∞ where a filter does not stay finite
+  std::vector<double> ratios;  ///< |error| in its ratio to its deviation, of states in Case II, else of innovations; of filters that stay finite
+};
+Explanation Explain(const nssm::Bundle& bundle, const std::vector<CalibrationRun>& runs, base::Executor* executor);
+
+/// ln of the factor by which variances must grow until bounds of 95 % hold 95 % of the errors: w of Calibrate. @return 0 without ratios.
+double LogWidening(std::vector<double> ratios);
+
+/// All variances times e^w: Q, R, what lasts, and what is not known of parameters.
+nssm::FilterNoise Widened(nssm::FilterNoise noise, double log_widening);
 
 }  // namespace metaekf::filter

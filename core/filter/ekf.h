@@ -86,6 +86,7 @@ struct NextSampleOf {
 };
 
 class Ekf;
+struct Future;
 using NextSample = NextSampleOf<Ekf>;
 
 /// Ekf::Step of filters on one FilterModel, which reads weights that they share once. What a filter does is to the bit what it does alone.
@@ -163,6 +164,7 @@ class Ekf {
 
  private:
   friend void StepTogether(std::span<NextSample> samples, FilterModel::Scratch* scratch);
+  friend absl::StatusOr<Future> Draw(const Ekf& ekf, const Eigen::MatrixXd& inputs, base::Rng* rng, FilterModel::Scratch* scratch);
   Ekf() = default;
 
   // The parts of a step, between which a function of the model is evaluated.

@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 
 #include "core/filter/chi_squared.h"
 
@@ -14,6 +13,7 @@ constexpr double kLowest = 0.82, kHighest = 1.17;  // (1.96/2.17)² and (1.96/1.
 constexpr double kTail = 0.0005;             // of the χ² test, on each side
 constexpr double kWhitest = 3.29;            // of a standard normal number: the same share is beyond
 constexpr int64_t kLeastPairs = 20;
+constexpr double kPast = 0.9;                // λ
 
 /// Samples that a mean over the last kMemory is worth: one with weights w (1 − w)^k has the variance of one over 2/w − 1 samples; a
 /// plain mean that of one over all.
@@ -21,7 +21,7 @@ double Effective(int64_t samples) { return samples < kMemory ? static_cast<doubl
 
 }  // namespace
 
-NisMonitor::NisMonitor(Eigen::Index outputs) : last(Eigen::VectorXd::Constant(outputs, std::numeric_limits<double>::quiet_NaN())) {}
+NisMonitor::NisMonitor(Eigen::Index outputs) : past(Eigen::VectorXd::Zero(outputs)) {}
 
 void NisMonitor::Add(double sample_nis, int sample_measured, const Eigen::Ref<const Eigen::VectorXd>& whitened) {
   samples = std::min(samples + 1, kMemory);
@@ -29,16 +29,18 @@ void NisMonitor::Add(double sample_nis, int sample_measured, const Eigen::Ref<co
   nis += weight * (sample_nis - nis);
   measured += weight * (sample_measured - measured);
   if (whitened.size() == 0) return;
-  if (last.size() == whitened.size() && !last.hasNaN()) {
+  if (!past.isZero(0)) {
     pairs = std::min(pairs + 1, kMemory);
-    correlation += (whitened.dot(last) - correlation) / static_cast<double>(pairs);
+    const double share = 1 / static_cast<double>(pairs);
+    correlation += share * (whitened.dot(past) - correlation);
+    past_square += share * (past.squaredNorm() - past_square);
   }
-  last = whitened;
+  past = kPast * past + whitened;
 }
 
 bool NisMonitor::Correlated() const {
-  if (pairs < kLeastPairs || !(nis > 0)) return false;
-  return correlation / nis * std::sqrt(Effective(pairs) * static_cast<double>(last.size())) > kWhitest;
+  if (pairs < kLeastPairs || !(nis > 0) || !(past_square > 0)) return false;
+  return correlation * std::sqrt(Effective(pairs) * static_cast<double>(past.size()) / (nis * past_square)) > kWhitest;
 }
 
 Health NisMonitor::Judge() const {

@@ -367,10 +367,10 @@ filter::CalibrationRun TailOf(const Bundle& adapted, const Trajectory& context, 
   return filter::RunOf(adapted, *data::SamplesFrom(context, begin));
 }
 
-/// The noise of an adapted model from what it has not seen.
+/// The noise of an adapted model from what it has not seen; the fleet's where that is how it is to be.
 nssm::FilterNoise OwnNoise(const Bundle& adapted, const filter::CalibrationRun& tail, double log_std, base::Executor* executor) {
-  if (adapted.noise.process.size() == 0) return adapted.noise;
-  return filter::Calibrate(adapted, {tail}, log_std, executor);
+  if (adapted.noise.process.size() == 0 || log_std == 0) return adapted.noise;
+  return filter::Widened(filter::Calibrate(adapted, {tail}, log_std, executor), adapted.noise.own_widening);
 }
 
 /// Samples of the context's end that are held out.

@@ -24,17 +24,26 @@ using data::Trajectory;
 using nssm::Bundle;
 using nssm::ModelSpec;
 
-/// Systems whose filters give the default covariances: those held out, then those trained on, unless they are known by heart, as those of a
-/// small fleet and those whose fits a prior has among its examples. The more the better, but each takes time that grows with the size of the state.
-std::vector<size_t> Judges(const TrainingSpec& spec, const data::Split& split) {
-  constexpr size_t kFleet = 10;
+/// Systems whose filters give the default covariances: those held out, then those trained on.
+struct Judges {
+  std::vector<size_t> systems;
+  size_t held_out = 0;  ///< so many of them, the first, were
+  size_t whole = 0;     ///< so many of them, the first, say all of the noise, which takes time that grows with the size of the state; the rest how wide bounds must be
+};
+
+Judges ChooseJudges(const TrainingSpec& spec, const data::Split& split) {
+  constexpr size_t kFleet = 10, kTellApart = 16, kMost = 400;
+  constexpr int32_t kFewestWhole = 8, kMostWhole = 80, kWork = 240;
   const ModelSpec& model = spec.model;
-  constexpr int32_t kFewest = 8, kMost = 80, kWork = 240;
-  std::vector<size_t> judges = split.validation;
+  Judges judges{.systems = split.validation, .held_out = split.validation.size()};
+  // A small fleet is known by heart, and so are systems whose fits a prior has among its examples. They say nothing of noise, and how wide bounds
+  // must be only beside so many others that the difference shows.
   const bool by_heart = spec.algorithm == Algorithm::kGaussianPrior || split.training.size() + split.validation.size() < kFleet;
-  if (judges.empty() || !by_heart) judges.insert(judges.end(), split.training.begin(), split.training.end());
-  const int32_t most = std::clamp(kWork / std::max(model.is_case_one() ? model.latent_size : model.state_size, 1), kFewest, kMost);
-  judges.resize(std::min(judges.size(), static_cast<size_t>(most)));
+  const bool count = judges.systems.empty() || !by_heart;
+  if (count || judges.held_out >= kTellApart) judges.systems.insert(judges.systems.end(), split.training.begin(), split.training.end());
+  judges.systems.resize(std::min(judges.systems.size(), kMost));
+  const int32_t most = std::clamp(kWork / std::max(model.is_case_one() ? model.latent_size : model.state_size, 1), kFewestWhole, kMostWhole);
+  judges.whole = std::min({count ? judges.systems.size() : judges.held_out, static_cast<size_t>(most)});
   return judges;
 }
 
@@ -103,41 +112,50 @@ absl::StatusOr<LearnedStart> SharedParameters(const TrainingSpec& spec, const ns
   return learned;
 }
 
-/// What a filter of a system is calibrated on: at most so many samples behind its context, and of all systems together, or all of a
-/// recording that is hardly longer than that.
-constexpr int64_t kCalibrationSamples = 2000, kAllCalibrationSamples = 48'000, kFewSamples = 50;
-constexpr double kLogStds[] = {0, 0.25, 0.5, 1, 2};
+/// What a filter of a system is calibrated on: at most so many samples behind its context, and of all systems together, those that say only
+/// how wide bounds must be apart, or all of a recording that is hardly longer than that.
+constexpr int64_t kCalibrationSamples = 2000, kAllCalibrationSamples = 48'000, kAllWidthSamples = 240'000, kFewSamples = 50;
+constexpr double kLogStds[] = {0, 0.25, 0.5, 1, 2};  // 0, the fleet's own, comes first
 
-/// How far systems' own Q and R are from the fleet's (FilterNoise::log_std): with which of kLogStds what the tails of contexts say
-/// helps most to explain what comes after.
-/// @param runs  that, a run for each context.
-double OwnNoise(const Bundle& bundle, const AdaptationOptions& options, const std::vector<Trajectory>& contexts,
-                const std::vector<filter::CalibrationRun>& runs, base::Executor* executor) {
+/// How far systems' own Q and R are from the fleet's (FilterNoise::log_std): with which of kLogStds what the tails of contexts say helps most
+/// to explain what comes after; and how much less their bounds hold of it than the fleet's do (FilterNoise::own_widening).
+/// @param runs  that, a run for each context. @param noise  receives both.
+void FindOwnNoise(const Bundle& bundle, const AdaptationOptions& options, const std::vector<Trajectory>& contexts,
+                  const std::vector<filter::CalibrationRun>& runs, base::Executor* executor, nssm::FilterNoise* noise) {
   const std::vector<double> candidates(std::begin(kLogStds), std::end(kLogStds));
-  std::vector<std::vector<double>> scores(contexts.size());
+  std::vector<std::vector<filter::Explanation>> of_systems(contexts.size());
   executor->ParallelFor(contexts.size(), [&](size_t i, size_t) {
     const absl::StatusOr<std::vector<nssm::FilterNoise>> noises = NoiseOfContext(bundle, contexts[i], options, candidates);
     if (!noises.ok()) return;  // says nothing, as above
     Bundle own = bundle;
-    for (const nssm::FilterNoise& noise : *noises) {
-      own.noise = noise;
-      scores[i].push_back(filter::LogLikelihood(own, {runs[i]}, base::CallingThread()));
+    for (const nssm::FilterNoise& found : *noises) {
+      own.noise = found;
+      of_systems[i].push_back(filter::Explain(own, {runs[i]}, base::CallingThread()));
     }
   });
-  double best = candidates.front(), most = -std::numeric_limits<double>::infinity();
+  double most = -std::numeric_limits<double>::infinity(), of_fleet = 0;
   for (size_t c = 0; c < candidates.size(); ++c) {
     double sum = 0;
-    for (const std::vector<double>& own : scores) sum += own.empty() ? 0 : own[c];
-    if (sum > most) most = sum, best = candidates[c];
+    std::vector<double> ratios;
+    for (const std::vector<filter::Explanation>& own : of_systems) {
+      if (own.empty()) continue;
+      sum += own[c].likelihood;
+      ratios.insert(ratios.end(), own[c].ratios.begin(), own[c].ratios.end());
+    }
+    const double widening = filter::LogWidening(std::move(ratios));
+    if (candidates[c] == 0) of_fleet = widening;
+    if (!(sum > most)) continue;
+    most = sum;
+    noise->log_std = candidates[c];
+    noise->own_widening = std::max(0.0, widening - of_fleet);
   }
-  return best;
 }
 
 /// Default Q, R and P₀ from the residuals of the model adapted to each of `systems`, Q and R scaled to what filters of these systems
 /// meet after the context (filter::Calibrate), and how far from them a system's own may be.
-/// @param held_out  so many of them, the first, have not been trained on.
-absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const TrainingSpec& spec,
-                                                       const std::vector<Trajectory>& systems, size_t held_out, base::Executor* executor) {
+/// @param systems  of `judges`, in their order.
+absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const TrainingSpec& spec, const std::vector<Trajectory>& systems,
+                                                       const Judges& judges, base::Executor* executor) {
   METAEKF_ASSIGN_OR_RETURN(const AdaptationOptions options, DefaultAdaptation(bundle));
   const int64_t wanted = std::max<int64_t>(spec.context_samples, ContextSamplesNeeded(spec.model, spec.loss));
   std::vector<std::optional<Bundle>> adapted(systems.size());
@@ -147,26 +165,29 @@ absl::StatusOr<nssm::FilterNoise> NoiseOfAdaptedModels(Bundle bundle, const Trai
     // An adaptation that diverges says nothing about noise; the unadapted model stands in.
     adapted[i] = found.ok() ? *std::move(found) : bundle;
   });
-  const int64_t most = std::min(kCalibrationSamples, kAllCalibrationSamples / static_cast<int64_t>(systems.size()));
+  const auto most = [](int64_t samples, size_t of) { return std::min(kCalibrationSamples, samples / std::max<int64_t>(static_cast<int64_t>(of), 1)); };
+  const int64_t most_whole = most(kAllCalibrationSamples, judges.whole), most_else = most(kAllWidthSamples, systems.size() - judges.whole);
   filter::NoiseEstimate noise(bundle);
   std::vector<filter::CalibrationRun> runs, later_runs;
   std::vector<Trajectory> contexts;  // of the later runs
   for (size_t i = 0; i < systems.size(); ++i) {
+    const bool whole = i < judges.whole;
     METAEKF_ASSIGN_OR_RETURN(const Trajectory normalised, data::Normalised(bundle.normaliser, systems[i]));
-    noise.Add(adapted[i]->parameters, normalised);
+    if (whole) noise.Add(adapted[i]->parameters, normalised);
     const int64_t begin = systems[i].length() - wanted < kFewSamples ? 0 : wanted;
     METAEKF_ASSIGN_OR_RETURN(const Trajectory later, data::SamplesFrom(systems[i], begin));
-    METAEKF_ASSIGN_OR_RETURN(Trajectory run, data::FirstSamples(later, std::min(later.length(), most)));
+    METAEKF_ASSIGN_OR_RETURN(Trajectory run, data::FirstSamples(later, std::min(later.length(), whole ? most_whole : most_else)));
     runs.push_back(filter::RunOf(*adapted[i], std::move(run)));
-    runs.back().trained_on = i >= held_out;
-    if (begin == 0) continue;
+    runs.back().trained_on = i >= judges.held_out;
+    runs.back().width_only = !whole;
+    if (begin == 0 || !whole) continue;
     METAEKF_ASSIGN_OR_RETURN(Trajectory context, data::FirstSamples(systems[i], wanted));
     contexts.push_back(std::move(context));
     later_runs.push_back(runs.back());
   }
   bundle.noise = noise.Result(bundle.normaliser);
   bundle.noise = filter::Calibrate(bundle, runs, std::numeric_limits<double>::infinity(), executor);
-  if (!contexts.empty()) bundle.noise.log_std = OwnNoise(bundle, options, contexts, later_runs, executor);
+  if (!contexts.empty()) FindOwnNoise(bundle, options, contexts, later_runs, executor, &bundle.noise);
   return bundle.noise;
 }
 
@@ -240,7 +261,8 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
   bundle.training = ToJson(spec);
   bundle.provenance = {{"systems", fleet.trajectories.size()}, {"iterations", state.iteration}};
   if (std::isfinite(state.best_validation_loss)) bundle.provenance["validation_loss"] = state.best_validation_loss;
-  METAEKF_ASSIGN_OR_RETURN(bundle.noise, NoiseOfAdaptedModels(bundle, spec, Pick(used.trajectories, Judges(spec, split)), split.validation.size(), executor));
+  const Judges judges = ChooseJudges(spec, split);
+  METAEKF_ASSIGN_OR_RETURN(bundle.noise, NoiseOfAdaptedModels(bundle, spec, Pick(used.trajectories, judges.systems), judges, executor));
   return bundle;
 }
 

@@ -27,6 +27,8 @@ struct FilterNoise {
   Eigen::MatrixXd initial;      ///< covariance of the first state, n × n
   /// How far a system's own Q and R are from these: standard deviation of the logarithm of a variance over the fleet.
   double log_std = 1;
+  /// ln of the factor by which variances that a system's context has led to must grow, so that bounds go on holding what those of the fleet hold.
+  double own_widening = 0;
   /// Errors of f and h that last, beside Q and R, which do not: in Case II, where residuals show them.
   GaussMarkov process_bias, measurement_bias;
   /// Deviation of what an adaptation has left open of the parameters, in that of its posterior: a filter's own, whose model is not linear

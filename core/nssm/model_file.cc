@@ -266,6 +266,7 @@ std::string WriteModelFile(const Bundle& bundle) {
         {"measurement_cov", ListOf(bundle.noise.measurement)},
         {"initial_cov", ListOf(bundle.noise.initial)},
         {"log_std", bundle.noise.log_std},
+        {"own_widening", bundle.noise.own_widening},
         {"process_bias", ToJson(bundle.noise.process_bias)},
         {"measurement_bias", ToJson(bundle.noise.measurement_bias)},
         {"parameter_std", bundle.noise.parameter_std}}},
@@ -314,6 +315,7 @@ absl::StatusOr<Bundle> ReadModelFile(const std::string& bytes) {
   bundle.noise.measurement = ReadCovariance(&noise_fields, noise, "measurement_cov", spec.output_size);
   bundle.noise.initial = ReadCovariance(&noise_fields, noise, "initial_cov", filter_size);
   bundle.noise.log_std = noise_fields.Number("log_std", FilterNoise().log_std, 0, 1e3);
+  bundle.noise.own_widening = noise_fields.Number("own_widening", FilterNoise().own_widening, 0, 1e3);
   bundle.noise.process_bias = ReadBias(&noise_fields, noise, "process_bias", filter_size);
   bundle.noise.measurement_bias = ReadBias(&noise_fields, noise, "measurement_bias", spec.output_size);
   bundle.noise.parameter_std = noise_fields.Number("parameter_std", FilterNoise().parameter_std, 0, 1e3);

@@ -9,7 +9,7 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-constexpr uint64_t kVersion = 3;
+constexpr uint64_t kVersion = 4;
 
 uint64_t Fnv1a(const char* data, size_t size) {
   uint64_t hash = 0xcbf29ce484222325;
@@ -60,9 +60,10 @@ void PutState(const filter::FilterState& state, Words* words) {
   words->Put(state.nis.measured);
   words->Put(state.nis.samples);
   words->Put(state.nis.correlation);
+  words->Put(state.nis.past_square);
   words->Put(state.nis.pairs);
-  words->Put(static_cast<int64_t>(state.nis.last.size()));
-  words->PutAll(state.nis.last.data(), state.nis.last.size());
+  words->Put(static_cast<int64_t>(state.nis.past.size()));
+  words->PutAll(state.nis.past.data(), state.nis.past.size());
   words->Put(state.gated_in_row);
   words->Put(static_cast<int64_t>(state.started));
   words->Put(static_cast<int64_t>(state.diverged));
@@ -80,11 +81,12 @@ bool TakeState(Words* words, filter::FilterState* state) {
   state->nis.measured = words->Take<double>();
   state->nis.samples = words->Take<int64_t>();
   state->nis.correlation = words->Take<double>();
+  state->nis.past_square = words->Take<double>();
   state->nis.pairs = words->Take<int64_t>();
-  const int64_t last = words->Take<int64_t>();
-  if (last < 0 || last > words->left()) return false;
-  state->nis.last.resize(last);
-  words->TakeAll(state->nis.last.data(), last);
+  const int64_t past = words->Take<int64_t>();
+  if (past < 0 || past > words->left()) return false;
+  state->nis.past.resize(past);
+  words->TakeAll(state->nis.past.data(), past);
   state->gated_in_row = words->Take<int64_t>();
   state->started = words->Take<int64_t>() != 0;
   state->diverged = words->Take<int64_t>() != 0;

@@ -44,6 +44,28 @@ TEST(FilterRunTest, BeginsWithTheStateThatTheContextEndsIn) {
   EXPECT_EQ(run->health.size(), static_cast<size_t>(kSamples - kContext));
 }
 
+// A filter that is wrong about the recording is right about what it believes.
+TEST(FilterRunTest, WhatAFilterBelievesIsHeldByItsBounds) {
+  filter::LinearSystem system;
+  system.Q *= 0.01;
+  const data::Trajectory recording = Recording(system);
+  const nssm::Bundle bundle = filter::LinearBundle(system);
+  const std::shared_ptr<const filter::FilterModel> functions = filter::FilterModel::Create(bundle);
+  const auto held = [&](const data::Trajectory& trajectory) {
+    const FilterRun run = *FilterAfterContext(bundle, functions, trajectory, kContext);
+    return Coverage(run, run.means - trajectory.states.rightCols(run.means.cols()), 1.96);
+  };
+  EXPECT_LT(held(recording), 0.8);
+  base::Rng rng(1);
+  double mean = 0;
+  for (int draw = 0; draw < 200; ++draw) {
+    const data::Trajectory believed = *AsFilterBelieves(bundle, functions, recording, kContext, &rng);
+    EXPECT_EQ(believed.states.leftCols(kContext), recording.states.leftCols(kContext));
+    mean += held(believed) / 200;
+  }
+  EXPECT_NEAR(mean, 0.95, 0.01);
+}
+
 TEST(FilterRunTest, CoverageIsTheShareOfErrorsInside) {
   const FilterRun run{.deviations = MatrixXd{{1, 1}, {2, 2}}};
   EXPECT_EQ(Coverage(run, MatrixXd{{1.5, -2.5}, {3.9, -4.1}}, 2), 0.5);

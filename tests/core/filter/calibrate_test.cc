@@ -96,6 +96,25 @@ TEST(CalibrateTest, WidensBoundsWhereNewSystemsAreFollowedWorseThanThoseTrainedO
   EXPECT_GT(ShareHeld(bundle, calibrate(worse, true), fresh), ShareHeld(bundle, calibrate(worse, false), fresh) + 0.02);
 }
 
+// Eight systems that happen to be easy say what noise is like; many more say how wide bounds must be, and nothing else.
+TEST(CalibrateTest, SystemsThatSayOnlyHowWideBoundsMustBeWidenAllAlike) {
+  const nssm::Bundle bundle = LinearBundle(LinearSystem());
+  LinearSystem usual;
+  usual.Q *= 9;
+  usual.R *= 3;
+  std::vector<CalibrationRun> runs = Runs(bundle, 8, 200, 1000), rest = Runs(bundle, 60, 200, 2000, usual);
+  for (CalibrationRun& run : rest) run.width_only = true;
+  const auto executor = base::MakeThreadExecutor(2);
+  const nssm::FilterNoise of_few = Calibrate(bundle, runs, kNoPrior, executor.get());
+  runs.insert(runs.end(), rest.begin(), rest.end());
+  const nssm::FilterNoise found = Calibrate(bundle, runs, kNoPrior, executor.get());
+  EXPECT_GT(found.process(0, 0), 2 * of_few.process(0, 0));
+  EXPECT_NEAR(found.process(0, 0) / of_few.process(0, 0), found.measurement(1, 1) / of_few.measurement(1, 1), 1e-6);
+  std::vector<CalibrationRun> fresh = Runs(bundle, 6, 200, 4000), others = Runs(bundle, 45, 200, 5000, usual);
+  fresh.insert(fresh.end(), others.begin(), others.end());
+  EXPECT_NEAR(ShareHeld(bundle, found, fresh), 0.95, 0.02);
+}
+
 // A model with a wrong A: its one-step residuals are small, but they last. What is calibrated holds the truth, what the residuals say
 // does not.
 TEST(CalibrateTest, CountsThatErrorsOfAModelLast) {
@@ -158,13 +177,22 @@ TEST(CalibrateTest, AStrongPriorKeepsWhatIsThere) {
 TEST(CalibrateTest, WhatItFindsExplainsRecordingsBetter) {
   nssm::Bundle bundle = LinearBundle(LinearSystem());
   const std::vector<CalibrationRun> runs = Runs(bundle, 3, 300);
-  const double of_truth = LogLikelihood(bundle, runs, base::CallingThread());
+  const double of_truth = Explain(bundle, runs, base::CallingThread()).likelihood;
   bundle.noise.process *= 20;
-  const double of_guess = LogLikelihood(bundle, runs, base::CallingThread());
+  const double of_guess = Explain(bundle, runs, base::CallingThread()).likelihood;
   bundle.noise = Calibrate(bundle, runs, kNoPrior, base::CallingThread());
-  const double of_found = LogLikelihood(bundle, runs, base::CallingThread());
+  const double of_found = Explain(bundle, runs, base::CallingThread()).likelihood;
   EXPECT_GT(of_truth, of_guess + 0.1);
   EXPECT_GT(of_found, of_truth - 0.01);
+}
+
+TEST(CalibrateTest, WidenedNoiseHoldsWhatItShould) {
+  nssm::Bundle bundle = LinearBundle(LinearSystem());
+  const std::vector<CalibrationRun> runs = Runs(bundle, 10, 500);
+  EXPECT_NEAR(LogWidening(Explain(bundle, runs, base::CallingThread()).ratios), 0, 0.1);
+  bundle.noise = Widened(bundle.noise, std::log(0.5));  // all of it: a gain depends on ratios alone, so errors are the same
+  EXPECT_NEAR(LogWidening(Explain(bundle, runs, base::CallingThread()).ratios), std::log(2), 0.1);
+  EXPECT_EQ(LogWidening({}), 0);
 }
 
 // Longer than what a search looks at.

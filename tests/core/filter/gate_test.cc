@@ -58,7 +58,7 @@ TEST(NisMonitorTest, SaysWhetherInnovationsGoOnAsTheLast) {
   base::Rng rng(5);
   // w = ρ w of the last sample + √(1 − ρ²) white: as large as the covariance says where `scale` is 1.
   const auto judge = [&](double rho, double scale) {
-    NisMonitor monitor;
+    NisMonitor monitor(2);
     VectorXd w = VectorXd::Zero(2);
     for (int t = 0; t < 1000; ++t) {
       for (double& component : w) component = rho * component + std::sqrt(1 - rho * rho) * rng.Normal();
@@ -75,8 +75,35 @@ TEST(NisMonitorTest, SaysWhetherInnovationsGoOnAsTheLast) {
   }
 }
 
+// An error of a fiftieth of the measurement's variance that lasts for twenty samples: the last innovation alone hardly shows it.
+TEST(NisMonitorTest, SeesASmallErrorThatLasts) {
+  base::Rng rng(8);
+  constexpr double kRho = 0.95;
+  const auto share_called = [&](double variance) {
+    int called = 0;
+    for (int run = 0; run < 100; ++run) {
+      NisMonitor monitor(2);
+      VectorXd error = VectorXd::Zero(2), w(2);
+      for (int t = 0; t < 400; ++t) {
+        for (Eigen::Index i = 0; i < 2; ++i) {
+          error[i] = kRho * error[i] + std::sqrt((1 - kRho * kRho) * variance) * rng.Normal();
+          w[i] = rng.Normal() + error[i];
+        }
+        monitor.Add(w.squaredNorm(), 2, w);
+        if (monitor.Correlated()) {
+          ++called;
+          break;
+        }
+      }
+    }
+    return called / 100.0;
+  };
+  EXPECT_LE(share_called(0), 0.1) << "at 99.95 %, at 400 samples that overlap";
+  EXPECT_GE(share_called(0.15), 0.8);
+}
+
 TEST(NisMonitorTest, SamplesThatAreNotMeasuredAsAWholeLeaveTheCorrelationAsItIs) {
-  NisMonitor monitor;
+  NisMonitor monitor(2);
   const VectorXd w{{1, 1}};
   for (int t = 0; t < 30; ++t) monitor.Add(2, 2, w);
   EXPECT_TRUE(monitor.Correlated());

@@ -70,6 +70,18 @@ TEST(AdaptTest, ZeroStepsLeaveTheModelAndFullyFrozenTensorsStay) {
   }
 }
 
+TEST(AdaptTest, ASystemsOwnNoiseWidensByWhatTrainingFound) {
+  nssm::Bundle bundle = *Train(SmallSpec(), Fleet(10, 80, 1), nullptr, base::CallingThread(), nullptr);
+  const Trajectory system = Fleet(1, 60, 3).trajectories[0];
+  const auto process = [&](double log_std, double own_widening) {
+    bundle.noise.log_std = log_std;
+    bundle.noise.own_widening = own_widening;
+    return Adapt(bundle, system, *DefaultAdaptation(bundle), nullptr)->noise.process;
+  };
+  EXPECT_NEAR(process(1, 0.5)(0, 0), std::exp(0.5) * process(1, 0)(0, 0), 1e-12 * process(1, 0)(0, 0));
+  EXPECT_EQ(process(0, 0.5), bundle.noise.process);  // nothing of its own
+}
+
 TEST(AdaptTest, BetterInFreeRunComparesAllOutputsTogether) {
   const double nan = std::numeric_limits<double>::quiet_NaN();
   const auto errors = [](std::vector<double> simulate) { return TailErrors{.simulate = std::move(simulate)}; };

@@ -110,12 +110,14 @@ TEST(ModelFileTest, ErrorsThatLastAreKeptInBothKindsOfFile) {
     base.noise.process_bias = {Eigen::MatrixXd::Random(n, 2), 0.9};
     base.noise.measurement_bias = {Eigen::MatrixXd::Random(n_y, 1), 0.1};
     base.noise.parameter_std = 0.3;
+    base.noise.own_widening = 0.7;
     const absl::StatusOr<Bundle> back = ReadModelFile(WriteModelFile(base));
     ASSERT_TRUE(back.ok()) << back.status();
     EXPECT_EQ(back->noise.process_bias.loadings, base.noise.process_bias.loadings);
     EXPECT_EQ(back->noise.process_bias.correlation, 0.9);
     EXPECT_EQ(back->noise.measurement_bias.loadings, base.noise.measurement_bias.loadings);
     EXPECT_EQ(back->noise.parameter_std, 0.3);
+    EXPECT_EQ(back->noise.own_widening, 0.7);
     Bundle adapted = base;
     adapted.noise.process_bias.loadings *= 2;
     adapted.noise.process_bias.correlation = 0.95;
