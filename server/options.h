@@ -13,6 +13,7 @@ struct ServerOptions {
   std::string data_directory;
   std::string listen = "127.0.0.1:50051";
   bool insecure = false;  ///< listens beyond loopback although nothing is encrypted
+  bool require_tokens = false;  ///< else whoever reaches the server may do everything
 
   int64_t model_cache_bytes = int64_t{512} << 20;
   size_t io_threads = 4;

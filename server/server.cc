@@ -104,15 +104,17 @@ class Server::Parts {
         compute({.threads = ComputeThreads(options.compute_threads),
                  .max_queued = Queued(),
                  .gives_way = true}),
-        context{*store, models, io, compute, training, jobs, options, absl::Now()},
+        access(*store, [] { return absl::Now(); }, options.require_tokens),
+        context{access, *store, models, io, compute, training, jobs, options, absl::Now()},
         sessions(*store, models),
-        estimation(sessions, io) {
+        estimation(context, sessions) {
     services.push_back(MakeModelService(context));
     services.push_back(MakeTrainingService(context));
     services.push_back(MakeAdaptationService(context));
     services.push_back(MakePredictionService(context));
     services.push_back(MakeSmoothingService(context));
     services.push_back(MakeServerService(context));
+    services.push_back(MakeAdminService(context));
   }
 
   absl::Status Listen(const Address& address) {
@@ -156,6 +158,7 @@ class Server::Parts {
   TrainingScheduler training;
   BackgroundExecutor io;
   BackgroundExecutor compute;
+  AccessControl access;
   const ServiceContext context;
   SessionManager sessions;
   EstimationService estimation;
@@ -171,6 +174,7 @@ absl::StatusOr<std::unique_ptr<Server>> Server::Start(const ServerOptions& optio
   METAEKF_ASSIGN_OR_RETURN(auto store,
                            store::Store::Open(options.data_directory, [] { return absl::Now(); }));
   auto parts = std::make_unique<Parts>(options, std::move(store));
+  METAEKF_RETURN_IF_ERROR(parts->access.Reload());
   METAEKF_RETURN_IF_ERROR(parts->Listen(address));
   METAEKF_RETURN_IF_ERROR(parts->training.Start());
   return std::unique_ptr<Server>(new Server(std::move(parts)));

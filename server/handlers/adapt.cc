@@ -28,7 +28,7 @@ constexpr absl::Duration kProgressPeriod = absl::Milliseconds(50);
 
 class AdaptCall final : public StreamHandler<Request, Response> {
  public:
-  explicit AdaptCall(const ServiceContext& context) : context_(context) {}
+  explicit AdaptCall(CallContext context) : context_(std::move(context)) {}
 
   absl::Status OnRequest(Request& request, Sink&) override {
     // So that the same request_id with other options or samples is recognised.
@@ -75,13 +75,13 @@ class AdaptCall final : public StreamHandler<Request, Response> {
       METAEKF_RETURN_IF_ERROR(CheckId("options.adaptation_id", request.adaptation_id()));
     }
     METAEKF_RETURN_IF_ERROR(ParseModelTarget("options.model", request.model()).status());
-    METAEKF_ASSIGN_OR_RETURN(model_, context_.models.Get("options.model", request.model()));
+    METAEKF_ASSIGN_OR_RETURN(model_, context_.server.models.Get(context_.caller.tenant, "options.model", request.model()));
     METAEKF_ASSIGN_OR_RETURN(options_, ResolveOptions(request, model_->bundle));
     METAEKF_ASSIGN_OR_RETURN(const ChannelCounts channels,
                              MatchChannels("options.channels", request.channels(), model_->bundle));
     assembler_.emplace(SampleRules{.channels = channels,
                                    .sample_period_s = model_->bundle.sample_period_s,
-                                   .max_samples = context_.options.limits.samples_per_call});
+                                   .max_samples = context_.server.options.limits.samples_per_call});
     return absl::OkStatus();
   }
 
@@ -128,7 +128,7 @@ class AdaptCall final : public StreamHandler<Request, Response> {
     sink.Send(std::move(response));
   }
 
-  const ServiceContext& context_;
+  CallContext context_;
   Request::Options request_;
   std::shared_ptr<const ServedModel> model_;
   meta::AdaptationOptions options_;
@@ -139,8 +139,8 @@ class AdaptCall final : public StreamHandler<Request, Response> {
 
 }  // namespace
 
-std::unique_ptr<StreamHandler<Request, Response>> Adapt(const ServiceContext& context) {
-  return std::make_unique<AdaptCall>(context);
+std::unique_ptr<StreamHandler<Request, Response>> Adapt(CallContext context) {
+  return std::make_unique<AdaptCall>(std::move(context));
 }
 
 }  // namespace metaekf::server

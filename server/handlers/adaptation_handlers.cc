@@ -7,7 +7,7 @@
 
 namespace metaekf::server {
 
-absl::Status GetAdaptation(const ServiceContext& context, const v1::GetAdaptationRequest& request,
+absl::Status GetAdaptation(CallContext& context, const v1::GetAdaptationRequest& request,
                            v1::Adaptation* response) {
   METAEKF_ASSIGN_OR_RETURN(const std::string id, ParseAdaptationName("name", request.name()));
   METAEKF_ASSIGN_OR_RETURN(const store::Adaptation adaptation, context.store.adaptations().Get(id));
@@ -15,7 +15,7 @@ absl::Status GetAdaptation(const ServiceContext& context, const v1::GetAdaptatio
   return absl::OkStatus();
 }
 
-absl::Status ListAdaptations(const ServiceContext& context,
+absl::Status ListAdaptations(CallContext& context,
                              const v1::ListAdaptationsRequest& request,
                              v1::ListAdaptationsResponse* response) {
   METAEKF_ASSIGN_OR_RETURN(const auto page,
@@ -29,7 +29,7 @@ absl::Status ListAdaptations(const ServiceContext& context,
   return absl::OkStatus();
 }
 
-absl::Status DeleteAdaptation(const ServiceContext& context,
+absl::Status DeleteAdaptation(CallContext& context,
                               const v1::DeleteAdaptationRequest& request,
                               google::protobuf::Empty*) {
   METAEKF_ASSIGN_OR_RETURN(const std::string id, ParseAdaptationName("name", request.name()));

@@ -7,6 +7,8 @@
 namespace metaekf::server {
 namespace {
 
+using store::Scope;
+
 using grpc::CallbackServerContext;
 using grpc::ServerUnaryReactor;
 
@@ -16,22 +18,25 @@ class AdaptationService final : public v1::AdaptationService::CallbackService {
 
   grpc::ServerBidiReactor<v1::AdaptRequest, v1::AdaptResponse>* Adapt(
       CallbackServerContext* call) override {
-    return new BidiCall(call, server::Adapt(context_), context_.io, context_.compute);
+    using Reactor = grpc::ServerBidiReactor<v1::AdaptRequest, v1::AdaptResponse>;
+    return Admitted<Reactor>(call, context_, Scope::kWrite, [&](CallContext context) {
+      return new BidiCall(call, server::Adapt(std::move(context)), context_.io, context_.compute);
+    });
   }
   ServerUnaryReactor* GetAdaptation(CallbackServerContext* call,
                                     const v1::GetAdaptationRequest* request,
                                     v1::Adaptation* response) override {
-    return RunUnary(call, context_, server::GetAdaptation, request, response);
+    return RunUnary(call, context_, Scope::kRead, server::GetAdaptation, request, response);
   }
   ServerUnaryReactor* ListAdaptations(CallbackServerContext* call,
                                       const v1::ListAdaptationsRequest* request,
                                       v1::ListAdaptationsResponse* response) override {
-    return RunUnary(call, context_, server::ListAdaptations, request, response);
+    return RunUnary(call, context_, Scope::kRead, server::ListAdaptations, request, response);
   }
   ServerUnaryReactor* DeleteAdaptation(CallbackServerContext* call,
                                        const v1::DeleteAdaptationRequest* request,
                                        google::protobuf::Empty* response) override {
-    return RunUnary(call, context_, server::DeleteAdaptation, request, response);
+    return RunUnary(call, context_, Scope::kWrite, server::DeleteAdaptation, request, response);
   }
 
  private:

@@ -19,7 +19,7 @@ using Request = v1::CreateTrainingJobRequest;
 
 class Create final : public StreamHandler<Request, v1::Job> {
  public:
-  explicit Create(const ServiceContext& context) : context_(context) {}
+  explicit Create(CallContext context) : context_(std::move(context)) {}
 
   absl::Status OnRequest(Request& request, ResponseSink<v1::Job>&) override {
     if (!checker_) {
@@ -45,7 +45,7 @@ class Create final : public StreamHandler<Request, v1::Job> {
     METAEKF_ASSIGN_OR_RETURN(const store::Job job,
                              context_.store.jobs().Create(
                                  {model, MessageToJson(header_.spec()), std::move(dataset), id}));
-    context_.training.Wake();
+    context_.server.training.Wake();
     sink.Send(ToMessage(job));
     return absl::OkStatus();
   }
@@ -65,7 +65,7 @@ class Create final : public StreamHandler<Request, v1::Job> {
 
   absl::Status Append(const Request& request) {
     METAEKF_RETURN_IF_ERROR(writer_->Append(DatasetFrame(request)));
-    const int64_t limit = context_.options.limits.dataset_bytes;
+    const int64_t limit = context_.server.options.limits.dataset_bytes;
     if (writer_->size_bytes() <= limit) return absl::OkStatus();
     return absl::ResourceExhaustedError(absl::StrCat(
         "the data has more than ", limit, " bytes, this server's limit; send a smaller fleet"));
@@ -73,15 +73,15 @@ class Create final : public StreamHandler<Request, v1::Job> {
 
   absl::Status CheckQueue() const {
     METAEKF_ASSIGN_OR_RETURN(const store::Inventory inventory,
-                             context_.store.TakeInventory(/*verify_files=*/false));
-    const auto limit = static_cast<int64_t>(context_.options.training.max_queued_jobs);
+                             context_.server.store.TakeInventory("", /*verify_files=*/false));
+    const auto limit = static_cast<int64_t>(context_.server.options.training.max_queued_jobs);
     if (inventory.queued_jobs < limit) return absl::OkStatus();
     return WithRetryDelay(absl::ResourceExhaustedError(absl::StrCat(
                               inventory.queued_jobs, " jobs are waiting, this server's limit")),
                           absl::Minutes(1));
   }
 
-  const ServiceContext& context_;
+  CallContext context_;
   Request::Header header_;
   std::optional<SampleChecker> checker_;  // once the header is there
   std::optional<store::BlobWriter> writer_;
@@ -89,8 +89,8 @@ class Create final : public StreamHandler<Request, v1::Job> {
 
 }  // namespace
 
-std::unique_ptr<StreamHandler<Request, v1::Job>> CreateTrainingJob(const ServiceContext& context) {
-  return std::make_unique<Create>(context);
+std::unique_ptr<StreamHandler<Request, v1::Job>> CreateTrainingJob(CallContext context) {
+  return std::make_unique<Create>(std::move(context));
 }
 
 }  // namespace metaekf::server

@@ -11,8 +11,8 @@ constexpr size_t kChunkBytes = size_t{64} << 10;
 
 class Export final : public ResponseSource<Response> {
  public:
-  Export(const ServiceContext& context, std::string name)
-      : context_(context), name_(std::move(name)) {}
+  Export(CallContext context, std::string name)
+      : context_(std::move(context)), name_(std::move(name)) {}
 
   absl::Status Open() override {
     store::ModelStore& models = context_.store.models();
@@ -34,7 +34,7 @@ class Export final : public ResponseSource<Response> {
   }
 
  private:
-  const ServiceContext& context_;
+  CallContext context_;
   const std::string name_;
   store::ModelVersion version_;
   std::string file_;
@@ -45,8 +45,8 @@ class Export final : public ResponseSource<Response> {
 }  // namespace
 
 std::unique_ptr<ResponseSource<Response>> ExportModelVersion(
-    const ServiceContext& context, const v1::ExportModelVersionRequest& request) {
-  return std::make_unique<Export>(context, request.name());
+    CallContext context, const v1::ExportModelVersionRequest& request) {
+  return std::make_unique<Export>(std::move(context), request.name());
 }
 
 }  // namespace metaekf::server

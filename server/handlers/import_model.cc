@@ -19,7 +19,7 @@ bool IsDigest(const std::string& text) {
 
 class Import final : public StreamHandler<Request, v1::ModelVersion> {
  public:
-  explicit Import(const ServiceContext& context) : context_(context) {}
+  explicit Import(CallContext context) : context_(std::move(context)) {}
 
   absl::Status OnRequest(Request& request, ResponseSink<v1::ModelVersion>&) override {
     if (!has_header_) return TakeHeader(request);
@@ -63,7 +63,7 @@ class Import final : public StreamHandler<Request, v1::ModelVersion> {
     header_ = request.header();
     has_header_ = true;
     METAEKF_ASSIGN_OR_RETURN(model_, ParseModelName("header.parent", header_.parent()));
-    const auto limit = static_cast<uint64_t>(context_.options.limits.model_file_bytes);
+    const auto limit = static_cast<uint64_t>(context_.server.options.limits.model_file_bytes);
     if (header_.size_bytes() == 0 || header_.size_bytes() > limit) {
       return FieldViolation("header.size_bytes", absl::StrCat("is ", header_.size_bytes(),
                                                               ", this server takes 1 to ", limit));
@@ -79,7 +79,7 @@ class Import final : public StreamHandler<Request, v1::ModelVersion> {
                                             " bytes that the header says have arrived"));
   }
 
-  const ServiceContext& context_;
+  CallContext context_;
   bool has_header_ = false;
   Request::Header header_;
   std::string model_;
@@ -89,8 +89,8 @@ class Import final : public StreamHandler<Request, v1::ModelVersion> {
 }  // namespace
 
 std::unique_ptr<StreamHandler<Request, v1::ModelVersion>> ImportModelVersion(
-    const ServiceContext& context) {
-  return std::make_unique<Import>(context);
+    CallContext context) {
+  return std::make_unique<Import>(std::move(context));
 }
 
 }  // namespace metaekf::server

@@ -8,7 +8,7 @@
 
 namespace metaekf::server {
 
-absl::Status ListModels(const ServiceContext& context, const v1::ListModelsRequest& request,
+absl::Status ListModels(CallContext& context, const v1::ListModelsRequest& request,
                         v1::ListModelsResponse* response) {
   METAEKF_ASSIGN_OR_RETURN(const auto page,
                            ListPage(request, [&](const store::PageRequest& wanted) {
@@ -19,7 +19,7 @@ absl::Status ListModels(const ServiceContext& context, const v1::ListModelsReque
   return absl::OkStatus();
 }
 
-absl::Status GetModel(const ServiceContext& context, const v1::GetModelRequest& request,
+absl::Status GetModel(CallContext& context, const v1::GetModelRequest& request,
                       v1::Model* response) {
   METAEKF_ASSIGN_OR_RETURN(const std::string name, ParseModelName("name", request.name()));
   METAEKF_ASSIGN_OR_RETURN(const store::Model model, context.store.models().Get(name));
@@ -27,7 +27,7 @@ absl::Status GetModel(const ServiceContext& context, const v1::GetModelRequest& 
   return absl::OkStatus();
 }
 
-absl::Status ListModelVersions(const ServiceContext& context,
+absl::Status ListModelVersions(CallContext& context,
                                const v1::ListModelVersionsRequest& request,
                                v1::ListModelVersionsResponse* response) {
   METAEKF_ASSIGN_OR_RETURN(const std::string model, ParseModelName("parent", request.parent()));
@@ -42,7 +42,7 @@ absl::Status ListModelVersions(const ServiceContext& context,
   return absl::OkStatus();
 }
 
-absl::Status GetModelVersion(const ServiceContext& context,
+absl::Status GetModelVersion(CallContext& context,
                              const v1::GetModelVersionRequest& request,
                              v1::ModelVersion* response) {
   METAEKF_ASSIGN_OR_RETURN(const store::ModelVersion version,
@@ -51,7 +51,7 @@ absl::Status GetModelVersion(const ServiceContext& context,
   return absl::OkStatus();
 }
 
-absl::Status SetModelAlias(const ServiceContext& context, const v1::SetModelAliasRequest& request,
+absl::Status SetModelAlias(CallContext& context, const v1::SetModelAliasRequest& request,
                            v1::ModelAlias* response) {
   METAEKF_ASSIGN_OR_RETURN(const Target target,
                            ParseAliasName("alias.name", request.alias().name()));
@@ -61,13 +61,13 @@ absl::Status SetModelAlias(const ServiceContext& context, const v1::SetModelAlia
   return absl::OkStatus();
 }
 
-absl::Status DeleteModelAlias(const ServiceContext& context,
+absl::Status DeleteModelAlias(CallContext& context,
                               const v1::DeleteModelAliasRequest& request, Empty*) {
   METAEKF_ASSIGN_OR_RETURN(const Target target, ParseAliasName("name", request.name()));
   return context.store.models().DeleteAlias(target.model, target.alias);
 }
 
-absl::Status DeleteModelVersion(const ServiceContext& context,
+absl::Status DeleteModelVersion(CallContext& context,
                                 const v1::DeleteModelVersionRequest& request, Empty*) {
   METAEKF_ASSIGN_OR_RETURN(const Target target, ParseVersionName("name", request.name()));
   return context.store.models().DeleteVersion(target.model, target.version);

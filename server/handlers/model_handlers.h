@@ -5,7 +5,7 @@
 #include <memory>
 
 #include "metaekf/v1/model.pb.h"
-#include "server/handlers/service_context.h"
+#include "server/handlers/call_context.h"
 #include "server/handlers/stream_handler.h"
 
 /// The RPCs of ModelService, as model.proto describes them.
@@ -13,26 +13,26 @@ namespace metaekf::server {
 
 using google::protobuf::Empty;
 
-absl::Status ListModels(const ServiceContext& context, const v1::ListModelsRequest& request,
+absl::Status ListModels(CallContext& context, const v1::ListModelsRequest& request,
                         v1::ListModelsResponse* response);
-absl::Status GetModel(const ServiceContext& context, const v1::GetModelRequest& request,
+absl::Status GetModel(CallContext& context, const v1::GetModelRequest& request,
                       v1::Model* response);
-absl::Status ListModelVersions(const ServiceContext& context,
+absl::Status ListModelVersions(CallContext& context,
                                const v1::ListModelVersionsRequest& request,
                                v1::ListModelVersionsResponse* response);
-absl::Status GetModelVersion(const ServiceContext& context,
+absl::Status GetModelVersion(CallContext& context,
                              const v1::GetModelVersionRequest& request, v1::ModelVersion* response);
-absl::Status SetModelAlias(const ServiceContext& context, const v1::SetModelAliasRequest& request,
+absl::Status SetModelAlias(CallContext& context, const v1::SetModelAliasRequest& request,
                            v1::ModelAlias* response);
-absl::Status DeleteModelAlias(const ServiceContext& context,
+absl::Status DeleteModelAlias(CallContext& context,
                               const v1::DeleteModelAliasRequest& request, Empty* response);
-absl::Status DeleteModelVersion(const ServiceContext& context,
+absl::Status DeleteModelVersion(CallContext& context,
                                 const v1::DeleteModelVersionRequest& request, Empty* response);
 
 std::unique_ptr<StreamHandler<v1::ImportModelVersionRequest, v1::ModelVersion>> ImportModelVersion(
-    const ServiceContext& context);
+    CallContext context);
 std::unique_ptr<ResponseSource<v1::ExportModelVersionResponse>> ExportModelVersion(
-    const ServiceContext& context, const v1::ExportModelVersionRequest& request);
+    CallContext context, const v1::ExportModelVersionRequest& request);
 
 /// The version that a name of any of the three forms means.
 absl::StatusOr<store::ModelVersion> ResolveVersion(store::ModelStore& models,

@@ -76,8 +76,8 @@ class PredictCall final : public TrajectoryCall<Request, Response> {
 
 }  // namespace
 
-std::unique_ptr<StreamHandler<Request, Response>> Predict(const ServiceContext& context) {
-  return std::make_unique<PredictCall>(context);
+std::unique_ptr<StreamHandler<Request, Response>> Predict(CallContext context) {
+  return std::make_unique<PredictCall>(std::move(context));
 }
 
 }  // namespace metaekf::server

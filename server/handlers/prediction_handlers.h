@@ -3,7 +3,7 @@
 #include <memory>
 
 #include "metaekf/v1/prediction.pb.h"
-#include "server/handlers/service_context.h"
+#include "server/handlers/call_context.h"
 #include "server/handlers/stream_handler.h"
 
 namespace metaekf::server {
@@ -11,6 +11,6 @@ namespace metaekf::server {
 /// PredictionService.Predict, as prediction.proto describes it. A trajectory is predicted when it
 /// is complete.
 std::unique_ptr<StreamHandler<v1::PredictRequest, v1::PredictResponse>> Predict(
-    const ServiceContext& context);
+    CallContext context);
 
 }  // namespace metaekf::server

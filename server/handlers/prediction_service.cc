@@ -1,4 +1,5 @@
 #include "metaekf/v1/prediction.grpc.pb.h"
+#include "server/handlers/admitted.h"
 #include "server/handlers/bidi_call.h"
 #include "server/handlers/prediction_handlers.h"
 #include "server/handlers/services.h"
@@ -6,13 +7,18 @@
 namespace metaekf::server {
 namespace {
 
+using store::Scope;
+
 class PredictionService final : public v1::PredictionService::CallbackService {
  public:
   explicit PredictionService(const ServiceContext& context) : context_(context) {}
 
   grpc::ServerBidiReactor<v1::PredictRequest, v1::PredictResponse>* Predict(
       grpc::CallbackServerContext* call) override {
-    return new BidiCall(call, server::Predict(context_), context_.compute, context_.compute);
+    using Reactor = grpc::ServerBidiReactor<v1::PredictRequest, v1::PredictResponse>;
+    return Admitted<Reactor>(call, context_, Scope::kRead, [&](CallContext context) {
+      return new BidiCall(call, server::Predict(std::move(context)), context_.compute, context_.compute);
+    });
   }
 
  private:

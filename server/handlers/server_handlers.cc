@@ -5,16 +5,20 @@
 
 namespace metaekf::server {
 
-absl::Status GetServerInfo(const ServiceContext& context, const v1::GetServerInfoRequest& request,
+absl::Status GetServerInfo(CallContext& context, const v1::GetServerInfoRequest& request,
                            v1::ServerInfo* response) {
+  // Who looks after the server sees everyone's.
+  const std::string tenant = context.caller.scope == store::Scope::kAdmin ? "" : context.caller.tenant;
   METAEKF_ASSIGN_OR_RETURN(const store::Inventory inventory,
-                           context.store.TakeInventory(request.verify_files()));
+                           context.server.store.TakeInventory(tenant, request.verify_files()));
   response->set_version(METAEKF_VERSION);
-  *response->mutable_start_time() = ToTimestamp(context.start_time);
+  *response->mutable_start_time() = ToTimestamp(context.server.start_time);
   v1::DataDirectory& directory = *response->mutable_data_directory();
   directory.set_format_version(static_cast<uint32_t>(inventory.format_version));
   directory.set_stored_bytes(static_cast<uint64_t>(inventory.stored_bytes));
-  directory.set_free_disk_bytes(static_cast<uint64_t>(inventory.free_disk_bytes));
+  if (tenant.empty()) {
+    directory.set_free_disk_bytes(static_cast<uint64_t>(inventory.free_disk_bytes));
+  }
   for (const std::string& problem : inventory.problems) directory.add_problems(problem);
   directory.set_model_count(static_cast<uint32_t>(inventory.models));
   directory.set_model_version_count(static_cast<uint32_t>(inventory.versions));

@@ -6,6 +6,8 @@
 namespace metaekf::server {
 namespace {
 
+using store::Scope;
+
 class ServerService final : public v1::ServerService::CallbackService {
  public:
   explicit ServerService(const ServiceContext& context) : context_(context) {}
@@ -13,7 +15,7 @@ class ServerService final : public v1::ServerService::CallbackService {
   grpc::ServerUnaryReactor* GetServerInfo(grpc::CallbackServerContext* call,
                                           const v1::GetServerInfoRequest* request,
                                           v1::ServerInfo* response) override {
-    return RunUnary(call, context_, server::GetServerInfo, request, response);
+    return RunUnary(call, context_, Scope::kRead, server::GetServerInfo, request, response);
   }
 
  private:

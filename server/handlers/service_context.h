@@ -1,5 +1,6 @@
 #pragma once
 
+#include "server/access/access_control.h"
 #include "server/executor/background_executor.h"
 #include "server/options.h"
 #include "server/serving/model_cache.h"
@@ -11,6 +12,7 @@ namespace metaekf::server {
 
 /// What the services work with; all of it outlives them.
 struct ServiceContext {
+  AccessControl& access;
   store::Store& store;
   ModelCache& models;
   BackgroundExecutor& io;       ///< SQL and files

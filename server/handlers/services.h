@@ -11,6 +11,7 @@ class Service;
 /// The gRPC services over the handlers of this folder. `context` outlives what is made.
 namespace metaekf::server {
 
+std::unique_ptr<grpc::Service> MakeAdminService(const ServiceContext& context);
 std::unique_ptr<grpc::Service> MakeModelService(const ServiceContext& context);
 std::unique_ptr<grpc::Service> MakeTrainingService(const ServiceContext& context);
 std::unique_ptr<grpc::Service> MakeAdaptationService(const ServiceContext& context);

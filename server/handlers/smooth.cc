@@ -80,8 +80,8 @@ class SmoothCall final : public TrajectoryCall<Request, Response> {
 
 }  // namespace
 
-std::unique_ptr<StreamHandler<Request, Response>> Smooth(const ServiceContext& context) {
-  return std::make_unique<SmoothCall>(context);
+std::unique_ptr<StreamHandler<Request, Response>> Smooth(CallContext context) {
+  return std::make_unique<SmoothCall>(std::move(context));
 }
 
 }  // namespace metaekf::server

@@ -1,4 +1,5 @@
 #include "metaekf/v1/smoothing.grpc.pb.h"
+#include "server/handlers/admitted.h"
 #include "server/handlers/bidi_call.h"
 #include "server/handlers/smoothing_handlers.h"
 #include "server/handlers/services.h"
@@ -6,13 +7,18 @@
 namespace metaekf::server {
 namespace {
 
+using store::Scope;
+
 class SmoothingService final : public v1::SmoothingService::CallbackService {
  public:
   explicit SmoothingService(const ServiceContext& context) : context_(context) {}
 
   grpc::ServerBidiReactor<v1::SmoothRequest, v1::SmoothResponse>* Smooth(
       grpc::CallbackServerContext* call) override {
-    return new BidiCall(call, server::Smooth(context_), context_.compute, context_.compute);
+    using Reactor = grpc::ServerBidiReactor<v1::SmoothRequest, v1::SmoothResponse>;
+    return Admitted<Reactor>(call, context_, Scope::kRead, [&](CallContext context) {
+      return new BidiCall(call, server::Smooth(std::move(context)), context_.compute, context_.compute);
+    });
   }
 
  private:

@@ -7,7 +7,7 @@
 
 namespace metaekf::server {
 
-absl::Status GetJob(const ServiceContext& context, const v1::GetJobRequest& request,
+absl::Status GetJob(CallContext& context, const v1::GetJobRequest& request,
                     v1::Job* response) {
   METAEKF_ASSIGN_OR_RETURN(const int64_t number, ParseJobName("name", request.name()));
   METAEKF_ASSIGN_OR_RETURN(const store::Job job, context.store.jobs().Get(number));
@@ -15,7 +15,7 @@ absl::Status GetJob(const ServiceContext& context, const v1::GetJobRequest& requ
   return absl::OkStatus();
 }
 
-absl::Status ListJobs(const ServiceContext& context, const v1::ListJobsRequest& request,
+absl::Status ListJobs(CallContext& context, const v1::ListJobsRequest& request,
                       v1::ListJobsResponse* response) {
   METAEKF_ASSIGN_OR_RETURN(const auto page,
                            ListPage(request, [&](const store::PageRequest& wanted) {
@@ -26,12 +26,12 @@ absl::Status ListJobs(const ServiceContext& context, const v1::ListJobsRequest& 
   return absl::OkStatus();
 }
 
-absl::Status CancelJob(const ServiceContext& context, const v1::CancelJobRequest& request,
+absl::Status CancelJob(CallContext& context, const v1::CancelJobRequest& request,
                        v1::Job* response) {
   METAEKF_ASSIGN_OR_RETURN(const int64_t number, ParseJobName("name", request.name()));
   METAEKF_ASSIGN_OR_RETURN(const store::Job job, context.store.jobs().Cancel(number));
-  context.training.CheckJobs();
-  context.jobs.Notify(number);
+  context.server.training.CheckJobs();
+  context.server.jobs.Notify({context.caller.tenant, number});
   *response = ToMessage(job);
   return absl::OkStatus();
 }

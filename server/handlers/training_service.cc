@@ -8,6 +8,8 @@
 namespace metaekf::server {
 namespace {
 
+using store::Scope;
+
 using grpc::CallbackServerContext;
 using grpc::ServerUnaryReactor;
 
@@ -17,23 +19,30 @@ class TrainingService final : public v1::TrainingService::CallbackService {
 
   grpc::ServerReadReactor<v1::CreateTrainingJobRequest>* CreateTrainingJob(
       CallbackServerContext* call, v1::Job* response) override {
-    return new UploadCall(call, server::CreateTrainingJob(context_), context_.io, response);
+    using Reactor = grpc::ServerReadReactor<v1::CreateTrainingJobRequest>;
+    return Admitted<Reactor>(call, context_, Scope::kWrite, [&](CallContext context) {
+      return new UploadCall(call, server::CreateTrainingJob(std::move(context)), context_.io,
+                            response);
+    });
   }
   ServerUnaryReactor* GetJob(CallbackServerContext* call, const v1::GetJobRequest* request,
                              v1::Job* response) override {
-    return RunUnary(call, context_, server::GetJob, request, response);
+    return RunUnary(call, context_, Scope::kRead, server::GetJob, request, response);
   }
   ServerUnaryReactor* ListJobs(CallbackServerContext* call, const v1::ListJobsRequest* request,
                                v1::ListJobsResponse* response) override {
-    return RunUnary(call, context_, server::ListJobs, request, response);
+    return RunUnary(call, context_, Scope::kRead, server::ListJobs, request, response);
   }
   grpc::ServerWriteReactor<v1::WatchJobResponse>* WatchJob(
-      CallbackServerContext*, const v1::WatchJobRequest* request) override {
-    return new WatchCall(context_, request->name());
+      CallbackServerContext* call, const v1::WatchJobRequest* request) override {
+    using Reactor = grpc::ServerWriteReactor<v1::WatchJobResponse>;
+    return Admitted<Reactor>(call, context_, Scope::kRead, [&](CallContext context) {
+      return new WatchCall(std::move(context), request->name());
+    });
   }
   ServerUnaryReactor* CancelJob(CallbackServerContext* call, const v1::CancelJobRequest* request,
                                 v1::Job* response) override {
-    return RunUnary(call, context_, server::CancelJob, request, response);
+    return RunUnary(call, context_, Scope::kWrite, server::CancelJob, request, response);
   }
 
  private:

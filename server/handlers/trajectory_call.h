@@ -7,7 +7,7 @@
 #include "absl/status/statusor.h"
 #include "core/base/status.h"
 #include "server/convert/samples.h"
-#include "server/handlers/service_context.h"
+#include "server/handlers/call_context.h"
 #include "server/handlers/stream_handler.h"
 #include "server/status/details.h"
 
@@ -17,7 +17,7 @@ namespace metaekf::server {
 template <class Request, class Response>
 class TrajectoryCall : public StreamHandler<Request, Response> {
  public:
-  explicit TrajectoryCall(const ServiceContext& context) : context_(context) {}
+  explicit TrajectoryCall(CallContext context) : context_(std::move(context)) {}
 
   absl::Status OnRequest(Request& request, ResponseSink<Response>& sink) final {
     if (!assembler_) {
@@ -49,17 +49,17 @@ class TrajectoryCall : public StreamHandler<Request, Response> {
 
  private:
   absl::Status Open(const Header& header) {
-    METAEKF_ASSIGN_OR_RETURN(model_, context_.models.Get("header.target", header.target()));
+    METAEKF_ASSIGN_OR_RETURN(model_, context_.server.models.Get(context_.caller.tenant, "header.target", header.target()));
     METAEKF_ASSIGN_OR_RETURN(const ChannelCounts channels, MatchChannels("header.channels", header.channels(), model_->bundle));
     METAEKF_RETURN_IF_ERROR(TakeHeader(header));
     assembler_.emplace(SampleRules{.channels = channels,
                                    .missing_measurements = true,
                                    .sample_period_s = model_->bundle.sample_period_s,
-                                   .max_samples = context_.options.limits.samples_per_call});
+                                   .max_samples = context_.server.options.limits.samples_per_call});
     return absl::OkStatus();
   }
 
-  const ServiceContext& context_;
+  CallContext context_;
   std::shared_ptr<const ServedModel> model_;
   std::optional<TrajectoryAssembler> assembler_;  // once the header is there
 };

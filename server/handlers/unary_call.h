@@ -6,8 +6,8 @@
 #include <utility>
 
 #include "server/executor/background_executor.h"
+#include "server/handlers/admitted.h"
 #include "server/handlers/overload.h"
-#include "server/handlers/service_context.h"
 #include "server/status/grpc_status.h"
 
 namespace metaekf::server {
@@ -18,7 +18,7 @@ template <class Work>
 grpc::ServerUnaryReactor* FinishWith(grpc::CallbackServerContext* call,
                                      BackgroundExecutor& executor, Work work) {
   grpc::ServerUnaryReactor* reactor = call->DefaultReactor();
-  const bool accepted = executor.Submit([call, reactor, work = std::move(work)] {
+  const bool accepted = executor.Submit([call, reactor, work = std::move(work)]() mutable {
     if (call->IsCancelled()) return reactor->Finish(grpc::Status::CANCELLED);
     reactor->Finish(ToGrpcStatus(work()));
   });
@@ -26,14 +26,18 @@ grpc::ServerUnaryReactor* FinishWith(grpc::CallbackServerContext* call,
   return reactor;
 }
 
-/// Answers a call with what a handler of this folder leaves in the response.
+/// Answers a call with what a handler of this folder leaves in the response, if the caller may.
 template <class Request, class Response>
-grpc::ServerUnaryReactor* RunUnary(grpc::CallbackServerContext* call, const ServiceContext& context,
-                                   absl::Status (*handler)(const ServiceContext&, const Request&,
-                                                           Response*),
+grpc::ServerUnaryReactor* RunUnary(grpc::CallbackServerContext* call, const ServiceContext& server,
+                                   store::Scope scope,
+                                   absl::Status (*handler)(CallContext&, const Request&, Response*),
                                    const Request* request, Response* response) {
-  return FinishWith(call, context.io,
-                    [=, &context] { return handler(context, *request, response); });
+  return Admitted<grpc::ServerUnaryReactor>(call, server, scope, [&](CallContext context) {
+    return FinishWith(call, server.io,
+                      [handler, request, response, context = std::move(context)]() mutable {
+                        return handler(context, *request, response);
+                      });
+  });
 }
 
 }  // namespace metaekf::server

@@ -7,14 +7,16 @@
 
 namespace metaekf::server {
 
-WatchCall::WatchCall(const ServiceContext& context, const std::string& name) : context_(context) {
+WatchCall::WatchCall(CallContext context, const std::string& name)
+    : context_(std::move(context)) {
   const auto job = ParseJobName("name", name);
   if (!job.ok()) {
     FinishWith(job.status());
     return;
   }
   job_ = *job;
-  subscription_ = context_.jobs.Subscribe(job_, [this](JobFeed::Event event) { OnEvent(event); });
+  subscription_ = context_.server.jobs.Subscribe(
+      {context_.caller.tenant, job_}, [this](JobFeed::Event event) { OnEvent(event); });
   std::unique_lock lock(mutex_);
   state_ = State::kIdle;
   Advance(std::move(lock));
@@ -44,7 +46,7 @@ void WatchCall::OnWriteDone(bool ok) {
 }
 
 void WatchCall::OnDone() {
-  if (subscription_) context_.jobs.Unsubscribe(*subscription_);
+  if (subscription_) context_.server.jobs.Unsubscribe(*subscription_);
   delete this;
 }
 
@@ -55,7 +57,7 @@ void WatchCall::Advance(std::unique_lock<std::mutex> lock) {
   changed_ = false;
   lock.unlock();
   if (stop) return Finish(ToGrpcStatus(*stop));
-  if (!context_.io.Submit([this] { Look(); })) FinishWith(Overloaded());
+  if (!context_.server.io.Submit([this] { Look(); })) FinishWith(Overloaded());
 }
 
 void WatchCall::Look() {

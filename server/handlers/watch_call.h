@@ -8,7 +8,7 @@
 #include <string>
 
 #include "metaekf/v1/training.pb.h"
-#include "server/handlers/service_context.h"
+#include "server/handlers/call_context.h"
 
 namespace metaekf::server {
 
@@ -16,7 +16,7 @@ namespace metaekf::server {
 /// the client reads are told together. Owns itself until the call is done.
 class WatchCall final : public grpc::ServerWriteReactor<v1::WatchJobResponse> {
  public:
-  WatchCall(const ServiceContext& context, const std::string& name);
+  WatchCall(CallContext context, const std::string& name);
 
   void OnWriteDone(bool ok) override;
   void OnCancel() override;
@@ -33,7 +33,7 @@ class WatchCall final : public grpc::ServerWriteReactor<v1::WatchJobResponse> {
   void Look();
   void FinishWith(const absl::Status& status);
 
-  const ServiceContext& context_;
+  CallContext context_;
   int64_t job_ = 0;
   std::optional<int64_t> subscription_;
 

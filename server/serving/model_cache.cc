@@ -22,6 +22,17 @@ absl::Status AsDataLoss(const absl::Status& status, const std::string& owner) {
       absl::StrCat(owner, ": the stored file cannot be used: ", std::string(status.message())));
 }
 
+absl::StatusOr<store::ModelVersion> Resolve(store::ModelStore& models, const Target& target) {
+  switch (target.kind) {
+    case Target::Kind::kVersion:
+      return models.GetVersion(target.model, target.version);
+    case Target::Kind::kAlias:
+      return models.GetByAlias(target.model, target.alias);
+    default:
+      return models.GetLatest(target.model);
+  }
+}
+
 template <class T>
 void EraseExpired(std::map<std::string, std::weak_ptr<T>>& map) {
   std::erase_if(map, [](const auto& entry) { return entry.second.expired(); });
@@ -29,49 +40,41 @@ void EraseExpired(std::map<std::string, std::weak_ptr<T>>& map) {
 
 }  // namespace
 
-absl::StatusOr<ModelCache::Model> ModelCache::Get(const std::string& field,
+absl::StatusOr<ModelCache::Model> ModelCache::Get(const std::string& tenant,
+                                                  const std::string& field,
                                                   const std::string& name) {
   METAEKF_ASSIGN_OR_RETURN(const Target target, ParseTarget(field, name));
-  if (target.kind == Target::Kind::kAdaptation) return GetAdaptation(target.adaptation);
-  METAEKF_ASSIGN_OR_RETURN(const store::ModelVersion version, Resolve(target));
-  return GetVersion(version);
+  store::TenantStore store = store_.Of(tenant);
+  if (target.kind == Target::Kind::kAdaptation) return GetAdaptation(store, target.adaptation);
+  METAEKF_ASSIGN_OR_RETURN(const store::ModelVersion version, Resolve(store.models(), target));
+  return GetVersion(store, version);
 }
 
-absl::StatusOr<store::ModelVersion> ModelCache::Resolve(const Target& target) {
-  switch (target.kind) {
-    case Target::Kind::kVersion:
-      return store_.models().GetVersion(target.model, target.version);
-    case Target::Kind::kAlias:
-      return store_.models().GetByAlias(target.model, target.alias);
-    default:
-      return store_.models().GetLatest(target.model);
-  }
-}
-
-ModelCache::Loaded ModelCache::GetVersion(const store::ModelVersion& version) {
+ModelCache::Loaded ModelCache::GetVersion(store::TenantStore& store,
+                                          const store::ModelVersion& version) {
   const std::string name = VersionName(version.model, version.version);
-  return GetOrLoad(name, [&]() -> Loaded {
-    METAEKF_ASSIGN_OR_RETURN(const std::string bytes, store_.models().ReadFile(version));
+  return GetOrLoad(absl::StrCat(store.tenant(), "/", name), [&]() -> Loaded {
+    METAEKF_ASSIGN_OR_RETURN(const std::string bytes, store.models().ReadFile(version));
     auto bundle = nssm::ReadModelFile(bytes);
     METAEKF_RETURN_IF_ERROR(AsDataLoss(bundle.status(), name));
-    return Serve(*std::move(bundle), name, "", nullptr);
+    return Serve(*std::move(bundle), store.tenant(), name, "", nullptr);
   });
 }
 
-ModelCache::Loaded ModelCache::GetAdaptation(const std::string& id) {
-  METAEKF_ASSIGN_OR_RETURN(const store::Adaptation adaptation, store_.adaptations().Get(id));
+ModelCache::Loaded ModelCache::GetAdaptation(store::TenantStore& store, const std::string& id) {
+  METAEKF_ASSIGN_OR_RETURN(const store::Adaptation adaptation, store.adaptations().Get(id));
   const std::string name = AdaptationName(id);
   // An id may be deleted and given to another adaptation, unlike the number of a version.
-  const std::string key = absl::StrCat(name, "@", adaptation.digest, "@",
+  const std::string key = absl::StrCat(store.tenant(), "/", name, "@", adaptation.digest, "@",
                                        VersionName(adaptation.model, adaptation.version));
   return GetOrLoad(key, [&]() -> Loaded {
     METAEKF_ASSIGN_OR_RETURN(const store::ModelVersion version,
-                             store_.models().GetVersion(adaptation.model, adaptation.version));
-    METAEKF_ASSIGN_OR_RETURN(const Model base, GetVersion(version));
-    METAEKF_ASSIGN_OR_RETURN(const std::string bytes, store_.adaptations().ReadFile(adaptation));
+                             store.models().GetVersion(adaptation.model, adaptation.version));
+    METAEKF_ASSIGN_OR_RETURN(const Model base, GetVersion(store, version));
+    METAEKF_ASSIGN_OR_RETURN(const std::string bytes, store.adaptations().ReadFile(adaptation));
     nssm::Bundle bundle = base->bundle;
     METAEKF_RETURN_IF_ERROR(AsDataLoss(nssm::ApplyAdaptedSubset(bytes, &bundle), name));
-    return Serve(std::move(bundle), base->model_version, name, base);
+    return Serve(std::move(bundle), store.tenant(), base->model_version, name, base);
   });
 }
 
@@ -109,10 +112,11 @@ ModelCache::Loaded ModelCache::GetOrLoad(const std::string& key, const Load& loa
   return loaded;
 }
 
-ModelCache::Loaded ModelCache::Serve(nssm::Bundle bundle, const std::string& version,
-                                     const std::string& adaptation, const Model& base) {
+ModelCache::Loaded ModelCache::Serve(nssm::Bundle bundle, const std::string& tenant,
+                                     const std::string& version, const std::string& adaptation,
+                                     const Model& base) {
   auto model = std::make_shared<ServedModel>(ServedModel{.bundle = std::move(bundle)});
-  model->filter_model = FilterModelOf(model->bundle, version);
+  model->filter_model = FilterModelOf(model->bundle, tenant, version);
   // What an adaptation leaves as it was is kept once.
   const bool shares = base != nullptr && base->filter_model == model->filter_model;
   model->filter_parameters = model->filter_model->Prepare(model->bundle, shares ? base->filter_parameters.get() : nullptr);
@@ -122,10 +126,12 @@ ModelCache::Loaded ModelCache::Serve(nssm::Bundle bundle, const std::string& ver
 }
 
 std::shared_ptr<const filter::FilterModel> ModelCache::FilterModelOf(const nssm::Bundle& bundle,
+                                                                    const std::string& tenant,
                                                                     const std::string& version) {
   // A fitted start takes the version's prior into the filter model.
   const nssm::ModelSpec& spec = bundle.model.spec();
-  const std::string architecture = absl::StrCat(spec.fits_start() ? version : "", nssm::ToJson(spec).dump());
+  const std::string owner = spec.fits_start() ? absl::StrCat(tenant, "/", version) : "";
+  const std::string architecture = absl::StrCat(owner, nssm::ToJson(spec).dump());
   const auto find = [&]() -> std::shared_ptr<const filter::FilterModel> {
     const auto found = filter_models_.find(architecture);
     return found == filter_models_.end() ? nullptr : found->second.lock();

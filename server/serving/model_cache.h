@@ -41,22 +41,25 @@ class ModelCache {
 
   /// @param target  models/{model}, …/versions/{version}, …/aliases/{alias} or
   /// adaptations/{adaptation}.
+  /// @param tenant  whose it is.
   /// @param field   of the request, for the violation if the name has another form.
   /// Errors: InvalidArgument; NotFound; DataLoss if a stored file is damaged.
-  absl::StatusOr<Model> Get(const std::string& field, const std::string& target);
+  absl::StatusOr<Model> Get(const std::string& tenant, const std::string& field,
+                            const std::string& target);
 
  private:
   using Loaded = absl::StatusOr<Model>;
 
-  absl::StatusOr<store::ModelVersion> Resolve(const Target& target);
-  Loaded GetVersion(const store::ModelVersion& version);
-  Loaded GetAdaptation(const std::string& id);
+  Loaded GetVersion(store::TenantStore& store, const store::ModelVersion& version);
+  Loaded GetAdaptation(store::TenantStore& store, const std::string& id);
   /// From the cache, from whoever loads it now, or by `load`.
   template <class Load>
   Loaded GetOrLoad(const std::string& key, const Load& load);
   /// @param base  that the bundle is adapted from, or null.
-  Loaded Serve(nssm::Bundle bundle, const std::string& version, const std::string& adaptation, const Model& base);
+  Loaded Serve(nssm::Bundle bundle, const std::string& tenant, const std::string& version,
+               const std::string& adaptation, const Model& base);
   std::shared_ptr<const filter::FilterModel> FilterModelOf(const nssm::Bundle& bundle,
+                                                          const std::string& tenant,
                                                           const std::string& version);
   void Keep(const Model& model);  // with mutex_ held
 

@@ -17,6 +17,7 @@ class BatchQueue;
 
 /// A session that a stream serves. `mutex` guards all but the constants.
 struct LiveSession {
+  std::string tenant;
   int64_t number = 0;
   uint64_t epoch = 0;
   std::string token;  ///< of a session just made; empty when resumed

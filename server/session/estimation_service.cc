@@ -37,8 +37,8 @@ absl::Status Draining(uint64_t durable_seq) {
 /// applied without it.
 class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse> {
  public:
-  EstimateStream(EstimationService* service, grpc::CallbackServerContext* context)
-      : service_(*service), context_(context) {}
+  EstimateStream(EstimationService* service, grpc::CallbackServerContext* context, CallContext caller)
+      : service_(*service), context_(context), caller_(std::move(caller)) {}
 
   void Start(bool draining) {
     std::lock_guard lock(mutex_);
@@ -156,7 +156,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
       }
       return;
     }
-    const bool accepted = live_ == nullptr ? service_.io_.Submit([this] { Work([this] { return OpenOrResume(); }); })
+    const bool accepted = live_ == nullptr ? service_.server_.io.Submit([this] { Work([this] { return OpenOrResume(); }); })
                                            : service_.heavy_.Submit([this] { Work([this] { return Apply(); }); });
     if (!accepted) WorkDone(Overloaded());
   }
@@ -204,10 +204,10 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
     absl::StatusOr<std::shared_ptr<LiveSession>> live;
     switch (work_.kind_case()) {
       case v1::EstimateRequest::kOpen:
-        live = service_.sessions_.Open(work_.open());
+        live = service_.sessions_.Open(caller_.store, work_.open());
         break;
       case v1::EstimateRequest::kResume:
-        live = service_.sessions_.Resume(work_.resume());
+        live = service_.sessions_.Resume(caller_.store, work_.resume());
         break;
       default:
         return FieldViolation("kind", "the first request must open or resume a session");
@@ -269,6 +269,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
 
   EstimationService& service_;
   grpc::CallbackServerContext* const context_;
+  CallContext caller_;
   v1::EstimateRequest request_;    // being read, or waiting
   v1::EstimateRequest work_;       // being worked on
   v1::EstimateResponse response_;  // being made or written
@@ -288,8 +289,8 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   steady_clock::time_point write_start_;
 };
 
-EstimationService::EstimationService(SessionManager& sessions, BackgroundExecutor& io)
-    : sessions_(sessions), io_(io), heavy_({.threads = 2, .max_queued = std::numeric_limits<size_t>::max()}), sweeps_([this] { RunSweeps(); }) {}
+EstimationService::EstimationService(const ServiceContext& server, SessionManager& sessions)
+    : server_(server), sessions_(sessions), heavy_({.threads = 2, .max_queued = std::numeric_limits<size_t>::max()}), sweeps_([this] { RunSweeps(); }) {}
 
 EstimationService::~EstimationService() {
   {
@@ -302,15 +303,18 @@ EstimationService::~EstimationService() {
 
 grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse>* EstimationService::Estimate(
     grpc::CallbackServerContext* context) {
-  auto* stream = new EstimateStream(this, context);
-  bool draining;
-  {
-    std::lock_guard lock(mutex_);
-    streams_.insert(stream);
-    draining = draining_;
-  }
-  stream->Start(draining);
-  return stream;
+  using Reactor = grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse>;
+  return Admitted<Reactor>(context, server_, store::Scope::kStream, [&](CallContext caller) {
+    auto* stream = new EstimateStream(this, context, std::move(caller));
+    bool draining;
+    {
+      std::lock_guard lock(mutex_);
+      streams_.insert(stream);
+      draining = draining_;
+    }
+    stream->Start(draining);
+    return stream;
+  });
 }
 
 void EstimationService::WorkThrough(const std::shared_ptr<BatchQueue>& queue) {
@@ -348,10 +352,17 @@ void EstimationService::Drain(steady_clock::time_point deadline) {
   changed_.wait(lock, [this] { return streams_.empty(); });
 }
 
+template <class Work>
+grpc::ServerUnaryReactor* EstimationService::Answer(grpc::CallbackServerContext* context, store::Scope scope, const Work& work) {
+  return Admitted<grpc::ServerUnaryReactor>(context, server_, scope, [&](CallContext caller) {
+    return FinishWith(context, server_.io, [work, caller = std::move(caller)]() mutable { return work(caller.store); });
+  });
+}
+
 grpc::ServerUnaryReactor* EstimationService::GetSession(grpc::CallbackServerContext* context,
                                                         const v1::GetSessionRequest* request, v1::Session* response) {
-  return FinishWith(context, io_, [this, request, response]() -> absl::Status {
-    METAEKF_ASSIGN_OR_RETURN(*response, sessions_.Get(request->name()));
+  return Answer(context, store::Scope::kRead, [this, request, response](store::TenantStore& mine) -> absl::Status {
+    METAEKF_ASSIGN_OR_RETURN(*response, sessions_.Get(mine, request->name()));
     return absl::OkStatus();
   });
 }
@@ -359,8 +370,8 @@ grpc::ServerUnaryReactor* EstimationService::GetSession(grpc::CallbackServerCont
 grpc::ServerUnaryReactor* EstimationService::ListSessions(grpc::CallbackServerContext* context,
                                                           const v1::ListSessionsRequest* request,
                                                           v1::ListSessionsResponse* response) {
-  return FinishWith(context, io_, [this, request, response]() -> absl::Status {
-    METAEKF_ASSIGN_OR_RETURN(*response, sessions_.List(*request));
+  return Answer(context, store::Scope::kRead, [this, request, response](store::TenantStore& mine) -> absl::Status {
+    METAEKF_ASSIGN_OR_RETURN(*response, sessions_.List(mine, *request));
     return absl::OkStatus();
   });
 }
@@ -368,7 +379,7 @@ grpc::ServerUnaryReactor* EstimationService::ListSessions(grpc::CallbackServerCo
 grpc::ServerUnaryReactor* EstimationService::DeleteSession(grpc::CallbackServerContext* context,
                                                            const v1::DeleteSessionRequest* request,
                                                            google::protobuf::Empty*) {
-  return FinishWith(context, io_, [this, request] { return sessions_.Delete(request->name()); });
+  return Answer(context, store::Scope::kStream, [this, request](store::TenantStore& mine) { return sessions_.Delete(mine, request->name()); });
 }
 
 }  // namespace metaekf::server

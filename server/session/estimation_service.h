@@ -9,6 +9,7 @@
 
 #include "metaekf/v1/estimation.grpc.pb.h"
 #include "server/executor/background_executor.h"
+#include "server/handlers/service_context.h"
 #include "server/session/session_manager.h"
 
 namespace metaekf::server {
@@ -18,8 +19,8 @@ class EstimateStream;
 /// The EstimationService of the wire over a SessionManager.
 class EstimationService : public v1::EstimationService::CallbackService {
  public:
-  /// @param io  for SQL and files. All arguments outlive the service.
-  EstimationService(SessionManager& sessions, BackgroundExecutor& io);
+  /// All arguments outlive the service.
+  EstimationService(const ServiceContext& server, SessionManager& sessions);
   ~EstimationService() override;
 
   /// Ends every stream with UNAVAILABLE (DRAINING, durable_seq) once its last response is out, and refuses new ones.
@@ -37,13 +38,16 @@ class EstimationService : public v1::EstimationService::CallbackService {
 
  private:
   friend class EstimateStream;
+  /// Answers with what `work` makes of the caller's part of the store.
+  template <class Work>
+  grpc::ServerUnaryReactor* Answer(grpc::CallbackServerContext* context, store::Scope scope, const Work& work);
   void Remove(EstimateStream* stream);
   /// Has batches that wait applied.
   void WorkThrough(const std::shared_ptr<BatchQueue>& queue);
   void RunSweeps();
 
+  const ServiceContext& server_;
   SessionManager& sessions_;
-  BackgroundExecutor& io_;
   BackgroundExecutor heavy_;  // batches that take longer than a reaction may; each stream has one at most
 
   std::mutex mutex_;

@@ -39,25 +39,25 @@ void SessionManager::RunCheckpoints() {
   }
 }
 
-absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Open(const v1::OpenSession& open) {
-  METAEKF_ASSIGN_OR_RETURN(const std::shared_ptr<const ServedModel> model, models_.Get("open.target", open.target()));
+absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Open(store::TenantStore& mine, const v1::OpenSession& open) {
+  METAEKF_ASSIGN_OR_RETURN(const std::shared_ptr<const ServedModel> model, models_.Get(mine.tenant(), "open.target", open.target()));
   // What is stored is the version that the name means now: a resumed session goes on with the same weights.
   v1::OpenSession settings = open;
   settings.set_target(model->adaptation.empty() ? model->model_version : model->adaptation);
   METAEKF_ASSIGN_OR_RETURN(std::unique_ptr<Session> session, Session::Open(model, settings));
   METAEKF_ASSIGN_OR_RETURN(const store::NewSession made,
-                           store_.sessions().Create(settings.target(), settings.SerializeAsString()));
-  return Attach(made.session, made.token, std::move(session), model->filter_model);
+                           mine.sessions().Create(settings.target(), settings.SerializeAsString()));
+  return Attach(mine.tenant(), made.session, made.token, std::move(session), model->filter_model);
 }
 
-absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Resume(const v1::ResumeSession& resume) {
+absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Resume(store::TenantStore& mine, const v1::ResumeSession& resume) {
   METAEKF_ASSIGN_OR_RETURN(const int64_t number, ParseSessionName("resume.session", resume.session()));
   // What an earlier stream applied here need not be sent again.
   Flush();
-  METAEKF_ASSIGN_OR_RETURN(const store::Session stored, store_.sessions().Claim(number, resume.token()));
+  METAEKF_ASSIGN_OR_RETURN(const store::Session stored, mine.sessions().Claim(number, resume.token()));
   v1::OpenSession settings;
   if (!settings.ParseFromString(stored.settings)) return absl::DataLossError("the session's settings are damaged");
-  METAEKF_ASSIGN_OR_RETURN(const std::shared_ptr<const ServedModel> model, models_.Get("target", settings.target()));
+  METAEKF_ASSIGN_OR_RETURN(const std::shared_ptr<const ServedModel> model, models_.Get(mine.tenant(), "target", settings.target()));
   METAEKF_ASSIGN_OR_RETURN(std::unique_ptr<Session> session, Session::Open(model, settings));
   if (!stored.checkpoint.empty()) {
     const std::shared_ptr<BatchQueue> queue = QueueOf(model->filter_model);
@@ -66,12 +66,13 @@ absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Resume(const v1::Re
     queue->GiveBack(std::move(scratch));
     METAEKF_RETURN_IF_ERROR(restored);
   }
-  return Attach(stored, "", std::move(session), model->filter_model);
+  return Attach(mine.tenant(), stored, "", std::move(session), model->filter_model);
 }
 
-std::shared_ptr<LiveSession> SessionManager::Attach(const store::Session& stored, const std::string& token, std::unique_ptr<Session> session,
+std::shared_ptr<LiveSession> SessionManager::Attach(const std::string& tenant, const store::Session& stored, const std::string& token, std::unique_ptr<Session> session,
                                                     const std::shared_ptr<const filter::FilterModel>& model) {
   auto live = std::make_shared<LiveSession>();
+  live->tenant = tenant;
   live->number = stored.number;
   live->epoch = static_cast<uint64_t>(stored.epoch);
   live->token = token;
@@ -81,7 +82,7 @@ std::shared_ptr<LiveSession> SessionManager::Attach(const store::Session& stored
   std::shared_ptr<LiveSession> before;
   {
     std::lock_guard lock(mutex_);
-    before = std::exchange(live_[stored.number], live);
+    before = std::exchange(live_[{tenant, stored.number}], live);
   }
   if (before != nullptr) {
     std::lock_guard lock(before->mutex);
@@ -109,7 +110,7 @@ void SessionManager::MarkDirty(const std::shared_ptr<LiveSession>& live) {
 
 void SessionManager::Close(const std::shared_ptr<LiveSession>& live) {
   std::lock_guard lock(mutex_);
-  const auto it = live_.find(live->number);
+  const auto it = live_.find({live->tenant, live->number});
   if (it != live_.end() && it->second == live) live_.erase(it);
 }
 
@@ -125,10 +126,10 @@ void SessionManager::Flush() {
   std::vector<store::SessionCheckpoint> checkpoints;
   for (const std::shared_ptr<LiveSession>& live : sessions) {
     std::lock_guard lock(live->mutex);
-    checkpoints.push_back({live->number, static_cast<int64_t>(live->epoch),
+    checkpoints.push_back({live->tenant, live->number, static_cast<int64_t>(live->epoch),
                            static_cast<int64_t>(live->session->applied_seq()), live->session->Checkpoint()});
   }
-  const absl::StatusOr<std::vector<bool>> written = store_.sessions().SaveCheckpoints(checkpoints);
+  const absl::StatusOr<std::vector<bool>> written = store_.SaveCheckpoints(checkpoints);
   if (!written.ok()) {
     // Nothing became durable; clients keep their samples. The next commit tries again.
     spdlog::error("checkpoints of {} sessions not written: {}", sessions.size(), written.status().ToString());
@@ -146,19 +147,20 @@ void SessionManager::Flush() {
   }
 }
 
-v1::Session SessionManager::ToMessage(const store::Session& stored) {
+std::shared_ptr<LiveSession> SessionManager::FindLive(const std::string& tenant, int64_t number) {
+  std::lock_guard lock(mutex_);
+  const auto it = live_.find({tenant, number});
+  return it == live_.end() ? nullptr : it->second;
+}
+
+v1::Session SessionManager::ToMessage(const std::string& tenant, const store::Session& stored) {
   v1::Session message;
   message.set_name(SessionName(stored.number));
   message.set_target(stored.target);
   message.set_epoch(static_cast<uint64_t>(stored.epoch));
   message.set_durable_seq(static_cast<uint64_t>(stored.durable_seq));
   *message.mutable_create_time() = ToTimestamp(stored.create_time);
-  std::shared_ptr<LiveSession> live;
-  {
-    std::lock_guard lock(mutex_);
-    const auto it = live_.find(stored.number);
-    if (it != live_.end()) live = it->second;
-  }
+  const std::shared_ptr<LiveSession> live = FindLive(tenant, stored.number);
   if (live != nullptr) {
     std::lock_guard lock(live->mutex);
     message.set_streaming(true);
@@ -167,30 +169,25 @@ v1::Session SessionManager::ToMessage(const store::Session& stored) {
   return message;
 }
 
-absl::StatusOr<v1::Session> SessionManager::Get(const std::string& name) {
+absl::StatusOr<v1::Session> SessionManager::Get(store::TenantStore& mine, const std::string& name) {
   METAEKF_ASSIGN_OR_RETURN(const int64_t number, ParseSessionName("name", name));
-  METAEKF_ASSIGN_OR_RETURN(const store::Session stored, store_.sessions().Get(number));
-  return ToMessage(stored);
+  METAEKF_ASSIGN_OR_RETURN(const store::Session stored, mine.sessions().Get(number));
+  return ToMessage(mine.tenant(), stored);
 }
 
-absl::StatusOr<v1::ListSessionsResponse> SessionManager::List(const v1::ListSessionsRequest& request) {
+absl::StatusOr<v1::ListSessionsResponse> SessionManager::List(store::TenantStore& mine, const v1::ListSessionsRequest& request) {
   METAEKF_ASSIGN_OR_RETURN(const store::Page<store::Session> page,
-                           store_.sessions().List({request.page_size(), request.page_token()}));
+                           mine.sessions().List({request.page_size(), request.page_token()}));
   v1::ListSessionsResponse response;
-  for (const store::Session& stored : page.items) *response.add_sessions() = ToMessage(stored);
+  for (const store::Session& stored : page.items) *response.add_sessions() = ToMessage(mine.tenant(), stored);
   response.set_next_page_token(page.next_page_token);
   return response;
 }
 
-absl::Status SessionManager::Delete(const std::string& name) {
+absl::Status SessionManager::Delete(store::TenantStore& mine, const std::string& name) {
   METAEKF_ASSIGN_OR_RETURN(const int64_t number, ParseSessionName("name", name));
-  METAEKF_RETURN_IF_ERROR(store_.sessions().Delete(number));
-  std::shared_ptr<LiveSession> live;
-  {
-    std::lock_guard lock(mutex_);
-    const auto it = live_.find(number);
-    if (it != live_.end()) live = it->second;
-  }
+  METAEKF_RETURN_IF_ERROR(mine.sessions().Delete(number));
+  const std::shared_ptr<LiveSession> live = FindLive(mine.tenant(), number);
   if (live != nullptr) {
     std::lock_guard lock(live->mutex);
     live->taken_over = true;

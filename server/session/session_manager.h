@@ -23,8 +23,9 @@ class SessionManager {
   SessionManager(store::Store& store, ModelCache& models);
   ~SessionManager();
 
-  absl::StatusOr<std::shared_ptr<LiveSession>> Open(const v1::OpenSession& open);
-  absl::StatusOr<std::shared_ptr<LiveSession>> Resume(const v1::ResumeSession& resume);
+  /// @param mine  of the caller's tenant, here and below.
+  absl::StatusOr<std::shared_ptr<LiveSession>> Open(store::TenantStore& mine, const v1::OpenSession& open);
+  absl::StatusOr<std::shared_ptr<LiveSession>> Resume(store::TenantStore& mine, const v1::ResumeSession& resume);
 
   /// Notes that samples were applied: they become durable with the next commit.
   void MarkDirty(const std::shared_ptr<LiveSession>& live);
@@ -33,22 +34,24 @@ class SessionManager {
   /// Writes what is dirty now.
   void Flush();
 
-  absl::StatusOr<v1::Session> Get(const std::string& name);
-  absl::StatusOr<v1::ListSessionsResponse> List(const v1::ListSessionsRequest& request);
-  absl::Status Delete(const std::string& name);
+  absl::StatusOr<v1::Session> Get(store::TenantStore& mine, const std::string& name);
+  absl::StatusOr<v1::ListSessionsResponse> List(store::TenantStore& mine, const v1::ListSessionsRequest& request);
+  absl::Status Delete(store::TenantStore& mine, const std::string& name);
 
  private:
   /// Puts a session behind its stream, and tells the stream that had it before.
-  std::shared_ptr<LiveSession> Attach(const store::Session& stored, const std::string& token, std::unique_ptr<Session> session,
+  std::shared_ptr<LiveSession> Attach(const std::string& tenant, const store::Session& stored, const std::string& token, std::unique_ptr<Session> session,
                                       const std::shared_ptr<const filter::FilterModel>& model);
   std::shared_ptr<BatchQueue> QueueOf(const std::shared_ptr<const filter::FilterModel>& model);
-  v1::Session ToMessage(const store::Session& stored);
+  v1::Session ToMessage(const std::string& tenant, const store::Session& stored);
+  /// The stream's that has it, or null.
+  std::shared_ptr<LiveSession> FindLive(const std::string& tenant, int64_t number);
   void RunCheckpoints();
 
   store::Store& store_;
   ModelCache& models_;
   std::mutex mutex_;
-  std::map<int64_t, std::shared_ptr<LiveSession>> live_;
+  std::map<std::pair<std::string, int64_t>, std::shared_ptr<LiveSession>> live_;  // by tenant and number
   std::set<std::shared_ptr<LiveSession>> dirty_;
   std::vector<std::weak_ptr<BatchQueue>> queues_;
   bool stopping_ = false;

@@ -1,10 +1,13 @@
 #include "server/store/adaptations.h"
 
 #include "core/base/status.h"
+#include "server/store/audit.h"
 #include "server/store/names.h"
 
 namespace metaekf::store {
 namespace {
+
+std::string Resource(const std::string& id) { return absl::StrCat("adaptations/", id); }
 
 constexpr const char* kRequestKind = "adaptation";
 constexpr const char* kSelect =
@@ -64,6 +67,9 @@ absl::StatusOr<Adaptation> Insert(const Context& context, Connection& connection
     return absl::NotFoundError(absl::StrCat("model '", wanted.model, "' has no version ",
                                             wanted.version, " to keep an adaptation of"));
   }
+  METAEKF_RETURN_IF_ERROR(
+      Audit(context, connection, "CreateAdaptation", Resource(adaptation.id),
+            absl::StrCat("models/", adaptation.model, "/versions/", adaptation.version)));
   METAEKF_RETURN_IF_ERROR(context.blobs.Publish(wanted.file));
   return adaptation;
 }
@@ -126,6 +132,7 @@ absl::Status AdaptationStore::Delete(const std::string& id) {
         METAEKF_ASSIGN_OR_RETURN(Adaptation found, Find(context_, connection, id));
         METAEKF_RETURN_IF_ERROR(connection.Execute(
             "DELETE FROM adaptations WHERE tenant = ?1 AND id = ?2", {context_.tenant, id}));
+        METAEKF_RETURN_IF_ERROR(Audit(context_, connection, "DeleteAdaptation", Resource(id)));
         return found;
       }));
   RemoveIfUnreferenced(context_, deleted.digest);

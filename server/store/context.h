@@ -14,13 +14,15 @@ namespace metaekf::store {
 
 using Clock = std::function<absl::Time()>;
 
-/// What every part of the store works with. The tenant is the first part of every key.
+/// What every part of the store works with. The tenant is the first part of every key; who acts for
+/// it is written down (audit.h).
 struct Context {
   Database& database;
   BlobStore& blobs;
   Clock clock;
   std::string jobs_directory;
   std::string tenant;
+  std::string identity;
 };
 
 /// The next number of a kind, from 1; never the same twice. In a write transaction.

@@ -3,6 +3,7 @@
 #include <filesystem>
 
 #include "core/base/status.h"
+#include "server/store/audit.h"
 #include "server/store/names.h"
 
 namespace metaekf::store {
@@ -12,8 +13,8 @@ constexpr const char* kKind = "job";
 constexpr const char* kStateNames[] = {"QUEUED", "RUNNING", "SUCCEEDED", "FAILED", "CANCELLED"};
 constexpr const char* kSelect =
     "SELECT number, model, spec_json, dataset_digest, state, attempt, failures, worker, lease_end, "
-    "progress_json, error, result_version, create_time, start_time, end_time FROM jobs "
-    "WHERE tenant = ?1 ";
+    "progress_json, error, result_version, create_time, start_time, end_time, tenant FROM jobs ";
+constexpr const char* kOfTenant = "WHERE tenant = ?1 ";
 
 const char* Name(JobState state) { return kStateNames[static_cast<int>(state)]; }
 
@@ -45,18 +46,11 @@ Job ReadJob(const Row& row) {
   return job;
 }
 
-/// The one job that `condition` (on ?2) picks, if any.
-absl::StatusOr<std::optional<Job>> SelectJob(const Context& context, Connection& connection,
-                                             const std::string& condition, const Value& value) {
-  std::optional<Job> found;
-  METAEKF_RETURN_IF_ERROR(connection.Execute(absl::StrCat(kSelect, condition),
-                                             {context.tenant, value},
-                                             [&](const Row& row) { found = ReadJob(row); }));
-  return found;
-}
-
 absl::StatusOr<Job> FindJob(const Context& context, Connection& connection, int64_t number) {
-  METAEKF_ASSIGN_OR_RETURN(auto found, SelectJob(context, connection, "AND number = ?2", number));
+  std::optional<Job> found;
+  METAEKF_RETURN_IF_ERROR(
+      connection.Execute(absl::StrCat(kSelect, kOfTenant, "AND number = ?2"), {context.tenant, number},
+                         [&](const Row& row) { found = ReadJob(row); }));
   if (found) return *std::move(found);
   return absl::NotFoundError(absl::StrCat("there is no job ", number));
 }
@@ -72,6 +66,8 @@ absl::Status Update(const Context& context, Connection& connection, const Job& j
        absl::ToUnixMicros(job.start_time), absl::ToUnixMicros(job.end_time)});
 }
 
+std::string Resource(int64_t number) { return absl::StrCat("jobs/", number); }
+
 void End(const Context& context, JobState state, Job& job) {
   job.state = state;
   job.end_time = context.clock();
@@ -80,13 +76,30 @@ void End(const Context& context, JobState state, Job& job) {
 void LoseAttempt(const Context& context, const std::string& reason, Job& job) {
   job.state = JobState::kQueued;
   job.error = absl::StrCat("attempt ", job.attempt, ": ", reason);
-  if (++job.failures < JobStore::kMaxFailures) return;
+  if (++job.failures < JobQueue::kMaxFailures) return;
   absl::StrAppend(&job.error, "; given up after ", job.failures,
                   " attempts in a row without a new checkpoint");
   End(context, JobState::kFailed, job);
 }
 
+std::string DirectoryOf(const Context& context, int64_t number) {
+  return absl::StrCat(context.jobs_directory, "/", JobDirectoryName(context.tenant, number));
+}
+
+/// After a job has ended.
+void CleanUp(const Context& context, const Job& job) {
+  if (job.state != JobState::kFailed) {
+    std::error_code ignored;  // the next start tries again
+    std::filesystem::remove_all(DirectoryOf(context, job.number), ignored);
+  }
+  RemoveIfUnreferenced(context, job.dataset_digest);
+}
+
 }  // namespace
+
+std::string JobDirectoryName(const std::string& tenant, int64_t number) {
+  return absl::StrCat(tenant, "-", number);
+}
 
 absl::StatusOr<Job> JobStore::Create(NewJob wanted) {
   METAEKF_RETURN_IF_ERROR(CheckName("model name", wanted.model));
@@ -103,6 +116,8 @@ absl::StatusOr<Job> JobStore::Create(NewJob wanted) {
     METAEKF_RETURN_IF_ERROR(context_.blobs.Publish(wanted.dataset));
     METAEKF_RETURN_IF_ERROR(
         RecordRequest(context_, connection, kKind, wanted.request, {"", number}));
+    METAEKF_RETURN_IF_ERROR(Audit(context_, connection, "CreateTrainingJob", Resource(number),
+                                  absl::StrCat("models/", wanted.model)));
     return FindJob(context_, connection, number);
   });
 }
@@ -118,122 +133,11 @@ absl::StatusOr<Page<Job>> JobStore::List(const PageRequest& request) {
   return context_.database.Read([&](Connection& connection) -> absl::StatusOr<Page<Job>> {
     std::vector<Job> jobs;
     METAEKF_RETURN_IF_ERROR(
-        connection.Execute(absl::StrCat(kSelect, "AND number < ?2 ORDER BY number DESC LIMIT ?3"),
+        connection.Execute(absl::StrCat(kSelect, kOfTenant, "AND number < ?2 ORDER BY number DESC LIMIT ?3"),
                            {context_.tenant, NumberLimit(cursor), cursor.size + 1},
                            [&](const Row& row) { jobs.push_back(ReadJob(row)); }));
     return MakePage(list, cursor, std::move(jobs),
                     [](const Job& job) { return absl::StrCat(job.number); });
-  });
-}
-
-absl::StatusOr<std::optional<Job>> JobStore::Claim(const std::string& worker,
-                                                   absl::Duration lease) {
-  using Claimed = absl::StatusOr<std::optional<Job>>;
-  return context_.database.Write([&](Connection& connection) -> Claimed {
-    METAEKF_ASSIGN_OR_RETURN(
-        auto job,
-        SelectJob(context_, connection, "AND state = ?2 ORDER BY number LIMIT 1", "QUEUED"));
-    if (!job) return std::nullopt;
-    job->state = JobState::kRunning;
-    ++job->attempt;
-    job->worker = worker;
-    job->start_time = context_.clock();
-    job->lease_end = job->start_time + lease;
-    METAEKF_RETURN_IF_ERROR(Update(context_, connection, *job));
-    return job;
-  });
-}
-
-absl::Status JobStore::WithLease(const JobLease& lease,
-                                 const std::function<absl::Status(Connection&, Job&)>& work) {
-  METAEKF_ASSIGN_OR_RETURN(
-      const Job job, context_.database.Write([&](Connection& connection) -> absl::StatusOr<Job> {
-        METAEKF_ASSIGN_OR_RETURN(Job leased, FindJob(context_, connection, lease.number));
-        if (leased.state != JobState::kRunning || leased.attempt != lease.attempt) {
-          return absl::AbortedError(absl::StrCat("attempt ", lease.attempt, " has lost job ",
-                                                 lease.number, ", which is ", Name(leased.state),
-                                                 " in attempt ", leased.attempt));
-        }
-        METAEKF_RETURN_IF_ERROR(work(connection, leased));
-        METAEKF_RETURN_IF_ERROR(Update(context_, connection, leased));
-        return leased;
-      }));
-  if (HasEnded(job.state)) CleanUp(job);
-  return absl::OkStatus();
-}
-
-absl::Status JobStore::Renew(const JobLease& lease, absl::Duration duration,
-                             const std::string& progress_json, bool checkpointed) {
-  return WithLease(lease, [&](Connection&, Job& job) {
-    job.lease_end = context_.clock() + duration;
-    job.progress_json = progress_json;
-    if (checkpointed) job.failures = 0;
-    return absl::OkStatus();
-  });
-}
-
-absl::StatusOr<ModelVersion> JobStore::Publish(const JobLease& lease, StagedBlob file,
-                                               const std::string& metadata_json) {
-  absl::StatusOr<ModelVersion> version;
-  const absl::Status status = WithLease(lease, [&](Connection& connection, Job& job) {
-    version = InsertVersion(context_, connection, job.model, file, metadata_json);
-    if (!version.ok()) return version.status();
-    job.result_version = version->version;
-    job.error.clear();
-    End(context_, JobState::kSucceeded, job);
-    return absl::OkStatus();
-  });
-  if (!status.ok()) return status;
-  return version;
-}
-
-absl::Status JobStore::Fail(const JobLease& lease, const std::string& error) {
-  return WithLease(lease, [&](Connection&, Job& job) {
-    job.error = error;
-    End(context_, JobState::kFailed, job);
-    return absl::OkStatus();
-  });
-}
-
-absl::Status JobStore::GiveBack(const JobLease& lease) {
-  return WithLease(lease, [&](Connection&, Job& job) {
-    job.state = JobState::kQueued;
-    return absl::OkStatus();
-  });
-}
-
-absl::Status JobStore::Lose(const JobLease& lease, const std::string& reason) {
-  return WithLease(lease, [&](Connection&, Job& job) {
-    LoseAttempt(context_, reason, job);
-    return absl::OkStatus();
-  });
-}
-
-absl::Status JobStore::LoseExpired() {
-  using Jobs = absl::StatusOr<std::vector<Job>>;
-  METAEKF_ASSIGN_OR_RETURN(
-      const auto expired, context_.database.Read([&](Connection& connection) -> Jobs {
-        std::vector<Job> jobs;
-        METAEKF_RETURN_IF_ERROR(
-            connection.Execute(absl::StrCat(kSelect, "AND state = 'RUNNING' AND lease_end < ?2"),
-                               {context_.tenant, absl::ToUnixMicros(context_.clock())},
-                               [&](const Row& row) { jobs.push_back(ReadJob(row)); }));
-        return jobs;
-      }));
-  for (const Job& job : expired) {
-    const absl::Status lost =
-        Lose({job.number, job.attempt}, absl::StrCat("worker ", job.worker, " stopped reporting"));
-    // It ended by itself meanwhile.
-    if (!lost.ok() && !absl::IsAborted(lost)) return lost;
-  }
-  return absl::OkStatus();
-}
-
-absl::Status JobStore::GiveBackAll() {
-  return context_.database.Write([&](Connection& connection) {
-    return connection.Execute(
-        "UPDATE jobs SET state = 'QUEUED' WHERE tenant = ?1 AND state = 'RUNNING'",
-        {context_.tenant});
   });
 }
 
@@ -248,24 +152,150 @@ absl::StatusOr<Job> JobStore::Cancel(int64_t number) {
         }
         End(context_, JobState::kCancelled, found);
         METAEKF_RETURN_IF_ERROR(Update(context_, connection, found));
+        METAEKF_RETURN_IF_ERROR(Audit(context_, connection, "CancelJob", Resource(number)));
         return found;
       }));
-  CleanUp(job);
+  CleanUp(context_, job);
   return job;
 }
 
-absl::StatusOr<std::string> JobStore::WorkDirectory(int64_t number) {
-  const std::string directory = absl::StrCat(context_.jobs_directory, "/", number);
-  METAEKF_RETURN_IF_ERROR(MakeDirectory(directory));
-  return directory;
+Context JobQueue::Of(const std::string& tenant) const {
+  Context context = context_;
+  context.tenant = tenant;
+  return context;
 }
 
-void JobStore::CleanUp(const Job& job) {
-  if (job.state != JobState::kFailed) {
-    std::error_code ignored;  // the next start tries again
-    std::filesystem::remove_all(absl::StrCat(context_.jobs_directory, "/", job.number), ignored);
+absl::StatusOr<std::optional<JobQueue::Claimed>> JobQueue::Claim(const std::string& worker,
+                                                                 absl::Duration lease) {
+  using Result = absl::StatusOr<std::optional<Claimed>>;
+  return context_.database.Write([&](Connection& connection) -> Result {
+    std::optional<Claimed> claimed;
+    METAEKF_RETURN_IF_ERROR(connection.Execute(
+        absl::StrCat(kSelect,
+                     "WHERE state = 'QUEUED' ORDER BY (SELECT count(*) FROM jobs AS running WHERE "
+                     "running.tenant = jobs.tenant AND running.state = 'RUNNING'), create_time, "
+                     "number LIMIT 1"),
+        {}, [&](const Row& row) {
+          Job job = ReadJob(row);
+          const JobLease taken{row.Text(15), job.number, job.attempt + 1};
+          claimed = Claimed{std::move(job), taken};
+        }));
+    if (!claimed) return std::nullopt;
+    Job& job = claimed->job;
+    job.state = JobState::kRunning;
+    ++job.attempt;
+    job.worker = worker;
+    job.start_time = context_.clock();
+    job.lease_end = job.start_time + lease;
+    METAEKF_RETURN_IF_ERROR(Update(Of(claimed->lease.tenant), connection, job));
+    return claimed;
+  });
+}
+
+absl::Status JobQueue::WithLease(
+    const JobLease& lease,
+    const std::function<absl::Status(const Context&, Connection&, Job&)>& work) {
+  const Context context = Of(lease.tenant);
+  METAEKF_ASSIGN_OR_RETURN(
+      const Job job, context.database.Write([&](Connection& connection) -> absl::StatusOr<Job> {
+        METAEKF_ASSIGN_OR_RETURN(Job leased, FindJob(context, connection, lease.number));
+        if (leased.state != JobState::kRunning || leased.attempt != lease.attempt) {
+          return absl::AbortedError(absl::StrCat("attempt ", lease.attempt, " has lost job ",
+                                                 lease.number, ", which is ", Name(leased.state),
+                                                 " in attempt ", leased.attempt));
+        }
+        METAEKF_RETURN_IF_ERROR(work(context, connection, leased));
+        METAEKF_RETURN_IF_ERROR(Update(context, connection, leased));
+        return leased;
+      }));
+  if (HasEnded(job.state)) CleanUp(context, job);
+  return absl::OkStatus();
+}
+
+absl::Status JobQueue::Renew(const JobLease& lease, absl::Duration duration,
+                             const std::string& progress_json, bool checkpointed) {
+  return WithLease(lease, [&](const Context& context, Connection&, Job& job) {
+    job.lease_end = context.clock() + duration;
+    job.progress_json = progress_json;
+    if (checkpointed) job.failures = 0;
+    return absl::OkStatus();
+  });
+}
+
+absl::StatusOr<ModelVersion> JobQueue::Publish(const JobLease& lease, StagedBlob file,
+                                               const std::string& metadata_json) {
+  absl::StatusOr<ModelVersion> version;
+  const absl::Status status =
+      WithLease(lease, [&](const Context& context, Connection& connection, Job& job) {
+        version = InsertVersion(context, connection, job.model, file, metadata_json);
+        if (!version.ok()) return version.status();
+        job.result_version = version->version;
+        job.error.clear();
+        End(context, JobState::kSucceeded, job);
+        return absl::OkStatus();
+      });
+  if (!status.ok()) return status;
+  return version;
+}
+
+absl::Status JobQueue::Fail(const JobLease& lease, const std::string& error) {
+  return WithLease(lease, [&](const Context& context, Connection&, Job& job) {
+    job.error = error;
+    End(context, JobState::kFailed, job);
+    return absl::OkStatus();
+  });
+}
+
+absl::Status JobQueue::GiveBack(const JobLease& lease) {
+  return WithLease(lease, [&](const Context&, Connection&, Job& job) {
+    job.state = JobState::kQueued;
+    return absl::OkStatus();
+  });
+}
+
+absl::Status JobQueue::Lose(const JobLease& lease, const std::string& reason) {
+  return WithLease(lease, [&](const Context& context, Connection&, Job& job) {
+    LoseAttempt(context, reason, job);
+    return absl::OkStatus();
+  });
+}
+
+absl::Status JobQueue::LoseExpired() {
+  struct Expired {
+    JobLease lease;
+    std::string worker;
+  };
+  using Leases = absl::StatusOr<std::vector<Expired>>;
+  METAEKF_ASSIGN_OR_RETURN(
+      const auto all, context_.database.Read([&](Connection& connection) -> Leases {
+        std::vector<Expired> expired;
+        METAEKF_RETURN_IF_ERROR(connection.Execute(
+            "SELECT tenant, number, attempt, worker FROM jobs "
+            "WHERE state = 'RUNNING' AND lease_end < ?1",
+            {absl::ToUnixMicros(context_.clock())}, [&](const Row& row) {
+              expired.push_back({{row.Text(0), row.Int(1), row.Int(2)}, row.Text(3)});
+            }));
+        return expired;
+      }));
+  for (const Expired& expired : all) {
+    const absl::Status lost =
+        Lose(expired.lease, absl::StrCat("worker ", expired.worker, " stopped reporting"));
+    // It ended by itself meanwhile.
+    if (!lost.ok() && !absl::IsAborted(lost)) return lost;
   }
-  RemoveIfUnreferenced(context_, job.dataset_digest);
+  return absl::OkStatus();
+}
+
+absl::Status JobQueue::GiveBackAll() {
+  return context_.database.Write([&](Connection& connection) {
+    return connection.Execute("UPDATE jobs SET state = 'QUEUED' WHERE state = 'RUNNING'");
+  });
+}
+
+absl::StatusOr<std::string> JobQueue::WorkDirectory(const JobLease& lease) {
+  const std::string directory = DirectoryOf(Of(lease.tenant), lease.number);
+  METAEKF_RETURN_IF_ERROR(MakeDirectory(directory));
+  return directory;
 }
 
 }  // namespace metaekf::store

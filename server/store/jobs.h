@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <optional>
 #include <string>
 
@@ -38,19 +39,15 @@ struct NewJob {
 /// A worker's right to a job. The attempt is a fencing token: once the job has been taken from the
 /// worker, nothing that it still sends has any effect.
 struct JobLease {
+  std::string tenant;
   int64_t number = 0;
   int64_t attempt = 0;
 };
 
-/// The queue of background jobs. Safe to call concurrently.
-///
-/// Functions that take a JobLease return Aborted if the job is no longer the worker's: cancelled,
-/// ended, or given to another. Errors of all: NotFound; the database's own.
+/// Background jobs of a tenant. Safe to call concurrently. Errors of all: NotFound; the database's
+/// own.
 class JobStore {
  public:
-  /// A job whose attempts are lost this often in a row without a new checkpoint has failed.
-  static constexpr int64_t kMaxFailures = 3;
-
   explicit JobStore(Context context) : context_(std::move(context)) {}
 
   /// Errors: InvalidArgument for a bad model name; AlreadyExists if the request.id was used with
@@ -59,10 +56,34 @@ class JobStore {
   absl::StatusOr<Job> Get(int64_t number);
   /// Newest first.
   absl::StatusOr<Page<Job>> List(const PageRequest& request);
+  /// Ends a job that has not ended; no change if it was cancelled before.
+  /// Errors: FailedPrecondition if it has succeeded or failed.
+  absl::StatusOr<Job> Cancel(int64_t number);
 
-  /// Gives the oldest queued job to a worker; nothing if none is queued.
+ private:
+  Context context_;
+};
+
+/// The jobs of all tenants, for those who work on them. Safe to call concurrently.
+///
+/// Functions that take a JobLease return Aborted if the job is no longer the worker's: cancelled,
+/// ended, or given to another. Errors of all: NotFound; the database's own.
+class JobQueue {
+ public:
+  /// A job whose attempts are lost this often in a row without a new checkpoint has failed.
+  static constexpr int64_t kMaxFailures = 3;
+
+  /// @param context  of any tenant.
+  explicit JobQueue(Context context) : context_(std::move(context)) {}
+
+  struct Claimed {
+    Job job;
+    JobLease lease;
+  };
+  /// Gives a queued job to a worker, nothing if none is queued: the oldest of the tenants that have
+  /// fewest running, so that none waits for all jobs of another.
   /// @param worker  unique per start of a worker.
-  absl::StatusOr<std::optional<Job>> Claim(const std::string& worker, absl::Duration lease);
+  absl::StatusOr<std::optional<Claimed>> Claim(const std::string& worker, absl::Duration lease);
   /// Extends the lease and tells the progress.
   /// @param checkpointed  a checkpoint was written since the last call: the attempt got somewhere.
   absl::Status Renew(const JobLease& lease, absl::Duration duration,
@@ -83,21 +104,21 @@ class JobStore {
   /// Queues all running jobs again: at a start, when workers of an earlier server do not count.
   absl::Status GiveBackAll();
 
-  /// Ends a job that has not ended; no change if it was cancelled before.
-  /// Errors: FailedPrecondition if it has succeeded or failed.
-  absl::StatusOr<Job> Cancel(int64_t number);
-
   /// A directory of the job's own, for checkpoints; it is there until the job has ended, and stays
   /// if the job has failed.
-  absl::StatusOr<std::string> WorkDirectory(int64_t number);
+  absl::StatusOr<std::string> WorkDirectory(const JobLease& lease);
 
  private:
+  /// The context of the job's tenant.
+  Context Of(const std::string& tenant) const;
   /// Runs `work` on the leased job in a write transaction; cleans up if the job has ended then.
   absl::Status WithLease(const JobLease& lease,
-                         const std::function<absl::Status(Connection&, Job&)>& work);
-  void CleanUp(const Job& job);
+                         const std::function<absl::Status(const Context&, Connection&, Job&)>& work);
 
   Context context_;
 };
+
+/// The name of a job's directory. No two tenants share one: numbers have no dash.
+std::string JobDirectoryName(const std::string& tenant, int64_t number);
 
 }  // namespace metaekf::store

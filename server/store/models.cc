@@ -3,6 +3,7 @@
 #include <optional>
 
 #include "core/base/status.h"
+#include "server/store/audit.h"
 #include "server/store/names.h"
 
 namespace metaekf::store {
@@ -63,6 +64,14 @@ absl::Status CheckUnused(const Context& context, Connection& connection, const s
       "version ", version, " of model '", model, "' is in use by ", user, "; delete that first"));
 }
 
+std::string VersionResource(const std::string& model, int64_t version) {
+  return absl::StrCat("models/", model, "/versions/", version);
+}
+
+std::string AliasResource(const std::string& model, const std::string& alias) {
+  return absl::StrCat("models/", model, "/aliases/", alias);
+}
+
 }  // namespace
 
 absl::StatusOr<ModelVersion> InsertVersion(const Context& context, Connection& connection,
@@ -78,6 +87,8 @@ absl::StatusOr<ModelVersion> InsertVersion(const Context& context, Connection& c
   METAEKF_RETURN_IF_ERROR(connection.Execute(
       "INSERT INTO versions VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7)",
       {context.tenant, model, number, version.digest, version.size_bytes, metadata_json, now}));
+  METAEKF_RETURN_IF_ERROR(
+      Audit(context, connection, "CreateModelVersion", VersionResource(model, number)));
   METAEKF_RETURN_IF_ERROR(context.blobs.Publish(file));
   return version;
 }
@@ -193,10 +204,12 @@ absl::Status ModelStore::SetAlias(const std::string& model, const std::string& a
   METAEKF_RETURN_IF_ERROR(CheckAlias(alias));
   return context_.database.Write([&](Connection& connection) -> absl::Status {
     METAEKF_RETURN_IF_ERROR(FindVersion(context_, connection, model, version).status());
-    return connection.Execute(
-        "INSERT INTO aliases VALUES (?1, ?2, ?3, ?4) "
-        "ON CONFLICT DO UPDATE SET version = excluded.version",
-        {context_.tenant, model, alias, version});
+    METAEKF_RETURN_IF_ERROR(
+        connection.Execute("INSERT INTO aliases VALUES (?1, ?2, ?3, ?4) "
+                           "ON CONFLICT DO UPDATE SET version = excluded.version",
+                           {context_.tenant, model, alias, version}));
+    return Audit(context_, connection, "SetModelAlias", AliasResource(model, alias),
+                 VersionResource(model, version));
   });
 }
 
@@ -205,8 +218,8 @@ absl::Status ModelStore::DeleteAlias(const std::string& model, const std::string
     METAEKF_RETURN_IF_ERROR(
         connection.Execute("DELETE FROM aliases WHERE tenant = ?1 AND model = ?2 AND alias = ?3",
                            {context_.tenant, model, alias}));
-    if (connection.changes() > 0) return absl::OkStatus();
-    return NoSuchAlias(model, alias);
+    if (connection.changes() == 0) return NoSuchAlias(model, alias);
+    return Audit(context_, connection, "DeleteModelAlias", AliasResource(model, alias));
   });
 }
 
@@ -220,6 +233,8 @@ absl::Status ModelStore::DeleteVersion(const std::string& model, int64_t version
         METAEKF_RETURN_IF_ERROR(connection.Execute(
             "DELETE FROM versions WHERE tenant = ?1 AND model = ?2 AND version = ?3",
             {context_.tenant, model, version}));
+        METAEKF_RETURN_IF_ERROR(Audit(context_, connection, "DeleteModelVersion",
+                                      VersionResource(model, version)));
         return found;
       }));
   RemoveIfUnreferenced(context_, deleted.digest);

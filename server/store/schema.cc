@@ -55,6 +55,29 @@ constexpr const char* kTables[] = {
          PRIMARY KEY (tenant, number)) STRICT, WITHOUT ROWID)",
 };
 
+// Since format 2. A time of 0 is never.
+constexpr const char* kSecurityTables[] = {
+    R"(CREATE TABLE tokens (
+         id TEXT PRIMARY KEY, digest TEXT NOT NULL UNIQUE, tenant TEXT NOT NULL,
+         scope TEXT NOT NULL, note TEXT NOT NULL, create_time INTEGER NOT NULL,
+         expire_time INTEGER NOT NULL, revoke_time INTEGER NOT NULL DEFAULT 0)
+         STRICT, WITHOUT ROWID)",
+    R"(CREATE TABLE audit (
+         number INTEGER PRIMARY KEY AUTOINCREMENT, time INTEGER NOT NULL, tenant TEXT NOT NULL,
+         identity TEXT NOT NULL, action TEXT NOT NULL, resource TEXT NOT NULL,
+         detail TEXT NOT NULL) STRICT)",
+    "CREATE INDEX audit_by_tenant ON audit (tenant, number)",
+    R"(CREATE TRIGGER audit_is_not_changed BEFORE UPDATE ON audit
+         BEGIN SELECT RAISE(ABORT, 'what was written down stays'); END)",
+    R"(CREATE TRIGGER audit_is_not_removed BEFORE DELETE ON audit
+         BEGIN SELECT RAISE(ABORT, 'what was written down stays'); END)",
+};
+
+absl::Status MakeSecurityTables(Connection& connection) {
+  for (const char* table : kSecurityTables) METAEKF_RETURN_IF_ERROR(connection.Execute(table));
+  return connection.Execute(absl::StrCat("PRAGMA user_version = ", kFormatVersion));
+}
+
 absl::Status MakeTables(Connection& connection) {
   int64_t tables = 0;
   METAEKF_RETURN_IF_ERROR(connection.Execute("SELECT count(*) FROM sqlite_schema", {},
@@ -64,7 +87,7 @@ absl::Status MakeTables(Connection& connection) {
         "metaekf.db was not written by this program; give --data-dir another directory");
   }
   for (const char* table : kTables) METAEKF_RETURN_IF_ERROR(connection.Execute(table));
-  return connection.Execute(absl::StrCat("PRAGMA user_version = ", kFormatVersion));
+  return MakeSecurityTables(connection);
 }
 
 }  // namespace
@@ -76,6 +99,7 @@ absl::Status PrepareSchema(Database& database) {
                                                [&](const Row& row) { version = row.Int(0); }));
     if (version == kFormatVersion) return absl::OkStatus();
     if (version == 0) return MakeTables(connection);
+    if (version == 1) return MakeSecurityTables(connection);
     return absl::FailedPreconditionError(
         absl::StrCat("the data directory has format ", version, ", this server knows format ",
                      kFormatVersion, "; start the server that wrote it, or use another directory"));

@@ -1,17 +1,14 @@
 #include "server/store/sessions.h"
 
-#include <sys/random.h>
-
-#include <cerrno>
 #include <optional>
 
-#include "absl/strings/escaping.h"
 #include "core/base/status.h"
+#include "server/store/audit.h"
+#include "server/store/secret.h"
 
 namespace metaekf::store {
 namespace {
 
-constexpr size_t kTokenBytes = 32;
 constexpr const char* kSelect =
     "SELECT number, target, settings, epoch, durable_seq, checkpoint, create_time FROM sessions "
     "WHERE tenant = ?1 ";
@@ -35,19 +32,13 @@ absl::StatusOr<Session> Find(const Context& context, Connection& connection, int
   return absl::NotFoundError(absl::StrCat("there is no session ", number));
 }
 
-absl::StatusOr<std::string> MakeToken() {
-  std::string bytes(kTokenBytes, '\0');
-  if (getrandom(bytes.data(), bytes.size(), 0) != static_cast<ssize_t>(bytes.size())) {
-    return ErrnoStatus(errno, "cannot draw random bytes");
-  }
-  return absl::BytesToHexString(bytes);
-}
+std::string Resource(int64_t number) { return absl::StrCat("sessions/", number); }
 
 }  // namespace
 
 absl::StatusOr<NewSession> SessionStore::Create(const std::string& target,
                                                 const std::string& settings) {
-  METAEKF_ASSIGN_OR_RETURN(const std::string token, MakeToken());
+  METAEKF_ASSIGN_OR_RETURN(const std::string token, NewSecret());
   return context_.database.Write([&](Connection& connection) -> absl::StatusOr<NewSession> {
     METAEKF_ASSIGN_OR_RETURN(const int64_t number, NextNumber(context_, connection, "session"));
     const int64_t now = absl::ToUnixMicros(context_.clock());
@@ -55,6 +46,8 @@ absl::StatusOr<NewSession> SessionStore::Create(const std::string& target,
         "INSERT INTO sessions (tenant, number, token_digest, target, settings, epoch, create_time) "
         "VALUES (?1, ?2, ?3, ?4, ?5, 1, ?6)",
         {context_.tenant, number, Sha256Hex(token), target, Bytes{settings}, now}));
+    METAEKF_RETURN_IF_ERROR(
+        Audit(context_, connection, "OpenSession", Resource(number), target));
     METAEKF_ASSIGN_OR_RETURN(Session session, Find(context_, connection, number));
     return NewSession{std::move(session), token};
   });
@@ -66,24 +59,13 @@ absl::StatusOr<Session> SessionStore::Claim(int64_t number, const std::string& t
         connection.Execute("UPDATE sessions SET epoch = epoch + 1 "
                            "WHERE tenant = ?1 AND number = ?2 AND token_digest = ?3",
                            {context_.tenant, number, Sha256Hex(token)}));
-    if (connection.changes() > 0) return Find(context_, connection, number);
-    return absl::NotFoundError(absl::StrCat("there is no session ", number, " with this token"));
-  });
-}
-
-absl::StatusOr<std::vector<bool>> SessionStore::SaveCheckpoints(
-    const std::vector<SessionCheckpoint>& checkpoints) {
-  return context_.database.Write([&](Connection& connection) -> absl::StatusOr<std::vector<bool>> {
-    std::vector<bool> written;
-    for (const SessionCheckpoint& checkpoint : checkpoints) {
-      METAEKF_RETURN_IF_ERROR(
-          connection.Execute("UPDATE sessions SET durable_seq = ?4, checkpoint = ?5 "
-                             "WHERE tenant = ?1 AND number = ?2 AND epoch = ?3",
-                             {context_.tenant, checkpoint.number, checkpoint.epoch,
-                              checkpoint.durable_seq, Bytes{checkpoint.checkpoint}}));
-      written.push_back(connection.changes() > 0);
+    if (connection.changes() == 0) {
+      return absl::NotFoundError(absl::StrCat("there is no session ", number, " with this token"));
     }
-    return written;
+    METAEKF_ASSIGN_OR_RETURN(Session session, Find(context_, connection, number));
+    METAEKF_RETURN_IF_ERROR(
+        Audit(context_, connection, "ResumeSession", Resource(number), session.target));
+    return session;
   });
 }
 
@@ -110,8 +92,26 @@ absl::Status SessionStore::Delete(int64_t number) {
   return context_.database.Write([&](Connection& connection) -> absl::Status {
     METAEKF_RETURN_IF_ERROR(connection.Execute(
         "DELETE FROM sessions WHERE tenant = ?1 AND number = ?2", {context_.tenant, number}));
-    if (connection.changes() > 0) return absl::OkStatus();
-    return absl::NotFoundError(absl::StrCat("there is no session ", number));
+    if (connection.changes() == 0) {
+      return absl::NotFoundError(absl::StrCat("there is no session ", number));
+    }
+    return Audit(context_, connection, "DeleteSession", Resource(number));
+  });
+}
+
+absl::StatusOr<std::vector<bool>> SaveCheckpoints(
+    Database& database, const std::vector<SessionCheckpoint>& checkpoints) {
+  return database.Write([&](Connection& connection) -> absl::StatusOr<std::vector<bool>> {
+    std::vector<bool> written;
+    for (const SessionCheckpoint& checkpoint : checkpoints) {
+      METAEKF_RETURN_IF_ERROR(
+          connection.Execute("UPDATE sessions SET durable_seq = ?4, checkpoint = ?5 "
+                             "WHERE tenant = ?1 AND number = ?2 AND epoch = ?3",
+                             {checkpoint.tenant, checkpoint.number, checkpoint.epoch,
+                              checkpoint.durable_seq, Bytes{checkpoint.checkpoint}}));
+      written.push_back(connection.changes() > 0);
+    }
+    return written;
   });
 }
 

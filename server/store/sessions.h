@@ -26,13 +26,14 @@ struct NewSession {
 };
 
 struct SessionCheckpoint {
+  std::string tenant;
   int64_t number = 0;
   int64_t epoch = 0;
   int64_t durable_seq = 0;
   std::string checkpoint;
 };
 
-/// Estimation sessions. The epoch is a fencing token: who claims a session takes it from whoever
+/// Estimation sessions of a tenant. The epoch is a fencing token: who claims a session takes it from whoever
 /// had it before. Safe to call concurrently.
 class SessionStore {
  public:
@@ -45,11 +46,6 @@ class SessionStore {
   /// Errors: NotFound if there is none or the token is wrong; which of them is not told.
   absl::StatusOr<Session> Claim(int64_t number, const std::string& token);
 
-  /// Writes many checkpoints in one commit.
-  /// @return for each, whether it was written; false: the session is no longer of that epoch.
-  absl::StatusOr<std::vector<bool>> SaveCheckpoints(
-      const std::vector<SessionCheckpoint>& checkpoints);
-
   /// Errors: NotFound.
   absl::StatusOr<Session> Get(int64_t number);
   /// Newest first.
@@ -60,5 +56,10 @@ class SessionStore {
  private:
   Context context_;
 };
+
+/// Writes checkpoints of any tenants in one commit.
+/// @return for each, whether it was written; false: the session is no longer of that epoch.
+absl::StatusOr<std::vector<bool>> SaveCheckpoints(Database& database,
+                                                  const std::vector<SessionCheckpoint>& checkpoints);
 
 }  // namespace metaekf::store

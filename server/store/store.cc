@@ -6,18 +6,17 @@
 #include <unistd.h>
 
 #include <cerrno>
+#include <cstdio>
 #include <filesystem>
 #include <set>
 #include <utility>
 
+#include "absl/strings/numbers.h"
 #include "core/base/status.h"
 #include "server/store/schema.h"
 
 namespace metaekf::store {
 namespace {
-
-// One tenant, until clients are told apart.
-constexpr const char* kTenant = "default";
 
 std::string DatabasePath(const std::string& directory) { return directory + "/metaekf.db"; }
 std::string JobsDirectory(const std::string& directory) { return directory + "/jobs"; }
@@ -36,6 +35,20 @@ absl::StatusOr<UniqueFd> Lock(const std::string& directory) {
   return file;
 }
 
+/// In format 1, before jobs had tenants, their directories were named by the number alone.
+absl::Status RenameOldJobDirectories(const std::string& jobs_directory) {
+  METAEKF_ASSIGN_OR_RETURN(const auto names, ListDirectory(jobs_directory));
+  for (const std::string& name : names) {
+    int64_t number = 0;
+    if (!absl::SimpleAtoi(name, &number)) continue;
+    const std::string to = JobDirectoryName(kDefaultTenant, number);
+    if (rename((jobs_directory + "/" + name).c_str(), (jobs_directory + "/" + to).c_str()) != 0) {
+      return ErrnoStatus(errno, absl::StrCat("cannot rename the directory of job ", number));
+    }
+  }
+  return absl::OkStatus();
+}
+
 /// A new database beside old files would have them removed as garbage.
 absl::Status CheckDatabaseNotLost(const std::string& directory, const BlobStore& blobs) {
   if (access(DatabasePath(directory).c_str(), F_OK) == 0) return absl::OkStatus();
@@ -47,15 +60,18 @@ absl::Status CheckDatabaseNotLost(const std::string& directory, const BlobStore&
                    "backup, or remove the directory to start anew"));
 }
 
-absl::Status CountRows(Connection& connection, Inventory& inventory) {
+absl::Status CountRows(Connection& connection, const std::string& tenant, Inventory& inventory) {
+  const auto of = [](const std::string& table) {
+    return absl::StrCat(" FROM ", table, " WHERE (?1 = '' OR tenant = ?1)");
+  };
   return connection.Execute(
-      "SELECT count(DISTINCT tenant || '/' || model), count(*), "
-      "(SELECT count(*) FROM adaptations), "
-      "(SELECT count(*) FROM jobs WHERE state = 'QUEUED'), "
-      "(SELECT count(*) FROM jobs WHERE state = 'RUNNING'), (SELECT count(*) FROM jobs), "
-      "(SELECT count(*) FROM sessions), "
-      "total(size_bytes) + (SELECT total(size_bytes) FROM adaptations) FROM versions",
-      {}, [&](const Row& row) {
+      absl::StrCat("SELECT count(DISTINCT tenant || '/' || model), count(*), (SELECT count(*)",
+                   of("adaptations"), "), (SELECT count(*)", of("jobs"),
+                   " AND state = 'QUEUED'), (SELECT count(*)", of("jobs"),
+                   " AND state = 'RUNNING'), (SELECT count(*)", of("jobs"), "), (SELECT count(*)",
+                   of("sessions"), "), total(size_bytes) + (SELECT total(size_bytes)",
+                   of("adaptations"), ")", of("versions")),
+      {tenant}, [&](const Row& row) {
         inventory.models = row.Int(0);
         inventory.versions = row.Int(1);
         inventory.adaptations = row.Int(2);
@@ -69,14 +85,16 @@ absl::Status CountRows(Connection& connection, Inventory& inventory) {
 
 using OwnedFiles = std::vector<std::pair<std::string, std::string>>;  // owner, digest
 
-absl::StatusOr<OwnedFiles> ListFiles(Connection& connection) {
+absl::StatusOr<OwnedFiles> ListFiles(Connection& connection, const std::string& tenant) {
   OwnedFiles files;
   METAEKF_RETURN_IF_ERROR(connection.Execute(
       "SELECT 'model ''' || model || ''' version ' || version, digest FROM versions "
+      "WHERE (?1 = '' OR tenant = ?1) "
       "UNION ALL SELECT 'adaptation ''' || id || '''', digest FROM adaptations "
+      "WHERE (?1 = '' OR tenant = ?1) "
       "UNION ALL SELECT 'the data of job ' || number, dataset_digest FROM jobs "
-      "WHERE state IN ('QUEUED', 'RUNNING')",
-      {}, [&](const Row& row) { files.emplace_back(row.Text(0), row.Text(1)); }));
+      "WHERE (?1 = '' OR tenant = ?1) AND state IN ('QUEUED', 'RUNNING')",
+      {tenant}, [&](const Row& row) { files.emplace_back(row.Text(0), row.Text(1)); }));
   return files;
 }
 
@@ -88,6 +106,7 @@ absl::StatusOr<std::unique_ptr<Store>> Store::Open(const std::string& directory,
   METAEKF_ASSIGN_OR_RETURN(BlobStore blobs, BlobStore::Open(directory));
   METAEKF_RETURN_IF_ERROR(CheckDatabaseNotLost(directory, blobs));
   METAEKF_RETURN_IF_ERROR(MakeDirectory(JobsDirectory(directory)));
+  METAEKF_RETURN_IF_ERROR(RenameOldJobDirectories(JobsDirectory(directory)));
   auto database = Database::Open(DatabasePath(directory));
   if (!database.ok()) return base::Annotate(database.status(), directory);
   METAEKF_RETURN_IF_ERROR(base::Annotate(PrepareSchema(**database), directory));
@@ -103,11 +122,27 @@ Store::Store(const std::string& directory, UniqueFd lock, BlobStore blobs,
       lock_(std::move(lock)),
       blobs_(std::move(blobs)),
       database_(std::move(database)),
-      context_{*database_, blobs_, std::move(clock), JobsDirectory(directory), kTenant},
-      models_(context_),
-      adaptations_(context_),
-      jobs_(context_),
-      sessions_(context_) {}
+      context_{*database_, blobs_, std::move(clock), JobsDirectory(directory), "", "server"},
+      job_queue_(context_),
+      audit_(context_) {}
+
+TenantStore Store::Of(const std::string& tenant, const std::string& identity) {
+  Context context = context_;
+  context.tenant = tenant;
+  context.identity = identity;
+  return TenantStore(context);
+}
+
+TokenStore Store::Tokens(const std::string& identity) {
+  Context context = context_;
+  context.identity = identity;
+  return TokenStore(context);
+}
+
+absl::StatusOr<std::vector<bool>> Store::SaveCheckpoints(
+    const std::vector<SessionCheckpoint>& checkpoints) {
+  return store::SaveCheckpoints(*database_, checkpoints);
+}
 
 absl::Status Store::CollectGarbage() {
   return database_->Write([&](Connection& connection) -> absl::Status {
@@ -120,26 +155,26 @@ absl::Status Store::CollectGarbage() {
 
     // Failed ones keep their last checkpoint.
     std::set<std::string> keep_directory;
-    METAEKF_RETURN_IF_ERROR(
-        connection.Execute("SELECT number FROM jobs WHERE state IN ('QUEUED', 'RUNNING', 'FAILED')",
-                           {}, [&](const Row& row) { keep_directory.insert(row.Text(0)); }));
+    METAEKF_RETURN_IF_ERROR(connection.Execute(
+        "SELECT tenant, number FROM jobs WHERE state IN ('QUEUED', 'RUNNING', 'FAILED')", {},
+        [&](const Row& row) { keep_directory.insert(JobDirectoryName(row.Text(0), row.Int(1))); }));
     METAEKF_ASSIGN_OR_RETURN(const auto directories, ListDirectory(context_.jobs_directory));
-    for (const std::string& number : directories) {
-      if (keep_directory.contains(number)) continue;
+    for (const std::string& name : directories) {
+      if (keep_directory.contains(name)) continue;
       std::error_code ignored;  // the next start tries again
-      std::filesystem::remove_all(absl::StrCat(context_.jobs_directory, "/", number), ignored);
+      std::filesystem::remove_all(absl::StrCat(context_.jobs_directory, "/", name), ignored);
     }
     return absl::OkStatus();
   });
 }
 
-absl::StatusOr<Inventory> Store::TakeInventory(bool verify_files) {
+absl::StatusOr<Inventory> Store::TakeInventory(const std::string& tenant, bool verify_files) {
   Inventory inventory;
   inventory.format_version = kFormatVersion;
   METAEKF_ASSIGN_OR_RETURN(
       const auto files, database_->Read([&](Connection& connection) -> absl::StatusOr<OwnedFiles> {
-        METAEKF_RETURN_IF_ERROR(CountRows(connection, inventory));
-        return ListFiles(connection);
+        METAEKF_RETURN_IF_ERROR(CountRows(connection, tenant, inventory));
+        return ListFiles(connection, tenant);
       }));
   for (const auto& [owner, digest] : files) {
     if (!verify_files && access(blobs_.Path(digest).c_str(), R_OK) == 0) continue;

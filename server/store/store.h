@@ -5,15 +5,17 @@
 #include <string>
 #include <vector>
 
-#include "server/store/adaptations.h"
+#include "server/store/audit.h"
 #include "server/store/blob_store.h"
 #include "server/store/context.h"
 #include "server/store/files.h"
-#include "server/store/jobs.h"
-#include "server/store/models.h"
-#include "server/store/sessions.h"
+#include "server/store/tenant_store.h"
+#include "server/store/tokens.h"
 
 namespace metaekf::store {
+
+/// Whose everything is where clients are not told apart.
+inline constexpr const char* kDefaultTenant = "default";
 
 /// What is in a data directory, and what is wrong with it.
 struct Inventory {
@@ -38,7 +40,7 @@ struct Inventory {
 ///   DIR/metaekf.db   the database
 ///   DIR/blobs/       model files, adaptations, data of jobs
 ///   DIR/tmp/         files being written
-///   DIR/jobs/N/      work directory of job N
+///   DIR/jobs/T-N/    work directory of job N of tenant T
 class Store {
  public:
   /// Makes the directory if there is none (its parent must exist).
@@ -46,15 +48,22 @@ class Store {
   /// another format; DataLoss if the database is damaged or gone while files are still there.
   static absl::StatusOr<std::unique_ptr<Store>> Open(const std::string& directory, Clock clock);
 
-  ModelStore& models() { return models_; }
-  AdaptationStore& adaptations() { return adaptations_; }
-  JobStore& jobs() { return jobs_; }
-  SessionStore& sessions() { return sessions_; }
+  /// What a tenant has, for a client of it. @param identity  of the client, for the audit log.
+  TenantStore Of(const std::string& tenant, const std::string& identity = "");
+  JobQueue& job_queue() { return job_queue_; }
+  /// For who looks after the server. @param identity  as above.
+  TokenStore Tokens(const std::string& identity = "");
+  AuditLog& audit() { return audit_; }
   const BlobStore& blobs() const { return blobs_; }
 
+  /// Writes checkpoints of sessions: as SaveCheckpoints.
+  absl::StatusOr<std::vector<bool>> SaveCheckpoints(
+      const std::vector<SessionCheckpoint>& checkpoints);
+
+  /// @param tenant  whose things are counted and looked at; empty: everyone's.
   /// @param verify_files  reads every file and compares its digest; else only looks whether it is
   /// there.
-  absl::StatusOr<Inventory> TakeInventory(bool verify_files);
+  absl::StatusOr<Inventory> TakeInventory(const std::string& tenant, bool verify_files);
 
  private:
   Store(const std::string& directory, UniqueFd lock, BlobStore blobs,
@@ -65,11 +74,9 @@ class Store {
   UniqueFd lock_;
   BlobStore blobs_;
   std::unique_ptr<Database> database_;
-  Context context_;
-  ModelStore models_;
-  AdaptationStore adaptations_;
-  JobStore jobs_;
-  SessionStore sessions_;
+  Context context_;  // of the server itself
+  JobQueue job_queue_;
+  AuditLog audit_;
 };
 
 }  // namespace metaekf::store

@@ -4,7 +4,7 @@
 
 namespace metaekf::server {
 
-int64_t JobFeed::Subscribe(int64_t job, Listener listener) {
+int64_t JobFeed::Subscribe(const Job& job, Listener listener) {
   std::lock_guard lock(mutex_);
   if (closed_) listener(Event::kClosed);
   subscriptions_[next_] = {job, std::move(listener)};
@@ -16,7 +16,7 @@ void JobFeed::Unsubscribe(int64_t subscription) {
   subscriptions_.erase(subscription);
 }
 
-void JobFeed::Notify(int64_t job) {
+void JobFeed::Notify(const Job& job) {
   std::lock_guard lock(mutex_);
   for (const auto& [number, subscription] : subscriptions_) {
     if (subscription.job == job) subscription.listener(Event::kChanged);

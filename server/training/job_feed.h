@@ -4,6 +4,8 @@
 #include <functional>
 #include <map>
 #include <mutex>
+#include <string>
+#include <utility>
 
 namespace metaekf::server {
 
@@ -15,20 +17,21 @@ class JobFeed {
     kClosed,  ///< the server stops: there will be no more
   };
   using Listener = std::function<void(Event)>;
+  using Job = std::pair<std::string, int64_t>;  ///< tenant and number
 
   /// Calls `listener` for every event from now on, from any thread; it must be quick and must not
   /// call the feed. Returns the number to unsubscribe with.
-  int64_t Subscribe(int64_t job, Listener listener);
+  int64_t Subscribe(const Job& job, Listener listener);
   /// The listener is not called any more when this returns.
   void Unsubscribe(int64_t subscription);
 
-  void Notify(int64_t job);
+  void Notify(const Job& job);
   /// Tells everyone kClosed, also who subscribes later.
   void Close();
 
  private:
   struct Subscription {
-    int64_t job;
+    Job job;
     Listener listener;
   };
 

@@ -66,12 +66,13 @@ class TrainingScheduler::Slot {
   void Run() {
     while (!scheduler_.stopping_) {
       const uint64_t seen = Queued();
-      const auto job = jobs().Claim(NewWorkerName(), kLease);
-      if (!job.ok()) spdlog::error("cannot take up a job: {}", job.status().ToString());
-      if (job.ok() && *job) {
-        RunAttempt(**job);
+      const auto claimed = jobs().Claim(NewWorkerName(), kLease);
+      if (!claimed.ok()) spdlog::error("cannot take up a job: {}", claimed.status().ToString());
+      if (claimed.ok() && *claimed) {
+        lease_ = (*claimed)->lease;
+        RunAttempt((*claimed)->job);
       } else {
-        WaitForWork(seen, job.ok() ? absl::InfiniteDuration() : kRetryPeriod);
+        WaitForWork(seen, claimed.ok() ? absl::InfiniteDuration() : kRetryPeriod);
       }
     }
   }
@@ -92,23 +93,23 @@ class TrainingScheduler::Slot {
   }
 
   void RunAttempt(const store::Job& job) {
-    lease_ = {job.number, job.attempt};
-    spdlog::info("job={} attempt={} model={} training begins", job.number, job.attempt, job.model);
-    scheduler_.feed_.Notify(job.number);
+    spdlog::info("tenant={} job={} attempt={} model={} training begins", lease_.tenant, job.number,
+                 job.attempt, job.model);
+    Notify();
     const absl::Status status = TryAttempt(job);
     if (absl::IsAborted(status) || absl::IsNotFound(status)) {
-      RemoveWorkDirectory(job.number);
+      RemoveWorkDirectory();
     } else if (!status.ok()) {
       spdlog::error("job={} attempt={} {}", job.number, job.attempt, status.ToString());
       jobs().Lose(lease_, std::string(status.message())).IgnoreError();
       WaitForWork(Queued(), kRetryPeriod);
     }
-    scheduler_.feed_.Notify(job.number);
+    Notify();
   }
 
   /// Errors: Aborted if the job was cancelled; what keeps a worker from starting.
   absl::Status TryAttempt(const store::Job& job) {
-    METAEKF_ASSIGN_OR_RETURN(const std::string directory, jobs().WorkDirectory(job.number));
+    METAEKF_ASSIGN_OR_RETURN(const std::string directory, jobs().WorkDirectory(lease_));
     METAEKF_ASSIGN_OR_RETURN(WorkerProcess worker,
                              WorkerProcess::Start(scheduler_.options_.training.worker_binary,
                                                   Arguments(job, directory)));
@@ -163,7 +164,7 @@ class TrainingScheduler::Slot {
     if (absl::ConsumePrefix(&rest, "error ")) told->error = std::string(rest);
     if (absl::ConsumePrefix(&rest, "progress ")) told->progress_json = std::string(rest);
     const absl::Status renewed = jobs().Renew(lease_, kLease, told->progress_json, checkpointed);
-    scheduler_.feed_.Notify(lease_.number);
+    Notify();
     if (renewed.ok() || absl::IsAborted(renewed)) return renewed;
     // The next word may find the store well again.
     spdlog::error("job={} cannot keep its progress: {}", lease_.number, renewed.ToString());
@@ -198,14 +199,16 @@ class TrainingScheduler::Slot {
   }
 
   /// Of a cancelled job: its worker may have written into it after the store removed it.
-  void RemoveWorkDirectory(int64_t job) {
-    const auto directory = jobs().WorkDirectory(job);
+  void RemoveWorkDirectory() {
+    const auto directory = jobs().WorkDirectory(lease_);
     if (!directory.ok()) return;
     std::error_code ignored;  // the next start tries again
     std::filesystem::remove_all(*directory, ignored);
   }
 
-  store::JobStore& jobs() { return scheduler_.store_.jobs(); }
+  void Notify() { scheduler_.feed_.Notify({lease_.tenant, lease_.number}); }
+
+  store::JobQueue& jobs() { return scheduler_.store_.job_queue(); }
 
   TrainingScheduler& scheduler_;
   const store::UniqueFd wake_fd_;
@@ -224,7 +227,7 @@ TrainingScheduler::TrainingScheduler(store::Store& store, JobFeed& feed,
 TrainingScheduler::~TrainingScheduler() { Stop(); }
 
 absl::Status TrainingScheduler::Start() {
-  METAEKF_RETURN_IF_ERROR(store_.jobs().GiveBackAll());
+  METAEKF_RETURN_IF_ERROR(store_.job_queue().GiveBackAll());
   for (const auto& slot : slots_) slot->Begin();
   return absl::OkStatus();
 }

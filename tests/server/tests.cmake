@@ -1,6 +1,6 @@
 metaekf_test(server/status/grpc_status_test.cc DEPS metaekf::server_status metaekf::proto_messages)
 metaekf_test(server/status/text_test.cc DEPS metaekf::server_status)
-foreach(test adaptations blob_store crash database jobs models names page sessions sha256 store)
+foreach(test adaptations audit blob_store crash database jobs models names page sessions sha256 store tokens)
   metaekf_test(server/store/${test}_test.cc DEPS metaekf::server_store)
 endforeach()
 
@@ -16,6 +16,8 @@ add_dependencies(metaekf_server_test_support metaekfd)  # the workers of jobs
 foreach(test adaptation_service model_service prediction_service smoothing_service training_service)
   metaekf_test(server/handlers/${test}_test.cc DEPS metaekf::server_test_support)
 endforeach()
+metaekf_test(server/access/access_control_test.cc DEPS metaekf::server_access)
+metaekf_test(server/access/matrix_test.cc DEPS metaekf::server_test_support metaekf::proto)
 metaekf_test(server/server_test.cc DEPS metaekf::server_test_support)
 metaekf_test(server/training/resume_test.cc LABELS slow DEPS metaekf::server_test_support)
 metaekf_test(server/fault/kill_test.cc LABELS slow TIMEOUT 600 DEPS metaekf::server_test_support metaekf::server_training)

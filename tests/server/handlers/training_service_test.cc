@@ -56,10 +56,10 @@ TEST_F(TrainingServiceTest, ATrainingThatFailsSaysWhy) {
   EXPECT_THAT(watched.value.back().error_message(), HasSubstr("diverged at iteration 1: loss"));
   EXPECT_EQ(watched.value.back().model_version(), "");
   // The last good state stays, also over a restart.
-  EXPECT_THAT(*store::ListDirectory(directory_.path() + "/jobs/1"), ElementsAre("checkpoint"));
+  EXPECT_THAT(*store::ListDirectory(directory_.path() + "/jobs/default-1"), ElementsAre("checkpoint"));
   Stop();
   Start();
-  EXPECT_THAT(*store::ListDirectory(directory_.path() + "/jobs/1"), ElementsAre("checkpoint"));
+  EXPECT_THAT(*store::ListDirectory(directory_.path() + "/jobs/default-1"), ElementsAre("checkpoint"));
 }
 
 TEST_F(TrainingServiceTest, ACancelledJobStopsForGood) {

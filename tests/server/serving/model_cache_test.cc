@@ -22,7 +22,7 @@ class ModelCacheTest : public store::StoreTest {
     const nssm::Bundle adapted = TinyBundle(seed);
     const auto mask = nn::ParseMask("output_decoder", adapted.model.layout()).value();
     ASSERT_TRUE(
-        store_->adaptations()
+        store_->Of(store::kDefaultTenant).adaptations()
             .Create({id, "robot", 1, Blob(nssm::WriteAdaptedSubset(adapted, mask)), "{}", {}})
             .ok());
   }
@@ -31,27 +31,27 @@ class ModelCacheTest : public store::StoreTest {
 TEST_F(ModelCacheTest, NamesLeadToTheirModels) {
   Add(1);
   Add(2);
-  ASSERT_TRUE(store_->models().SetAlias("robot", "stable", 1).ok());
+  ASSERT_TRUE(store_->Of(store::kDefaultTenant).models().SetAlias("robot", "stable", 1).ok());
   ModelCache cache(*store_, kAmple);
-  const auto latest = cache.Get("f", "models/robot").value();
+  const auto latest = cache.Get(store::kDefaultTenant, "f", "models/robot").value();
   EXPECT_EQ(latest->model_version, "models/robot/versions/2");
   EXPECT_EQ(latest->adaptation, "");
   EXPECT_EQ(latest->bundle.parameters, TinyBundle(2).parameters);
-  const auto stable = cache.Get("f", "models/robot/aliases/stable").value();
+  const auto stable = cache.Get(store::kDefaultTenant, "f", "models/robot/aliases/stable").value();
   EXPECT_EQ(stable->bundle.parameters, TinyBundle(1).parameters);
-  EXPECT_EQ(cache.Get("f", "models/robot/versions/1").value(), stable);
+  EXPECT_EQ(cache.Get(store::kDefaultTenant, "f", "models/robot/versions/1").value(), stable);
 
   // A name means what it means now.
-  ASSERT_TRUE(store_->models().SetAlias("robot", "stable", 2).ok());
-  EXPECT_EQ(cache.Get("f", "models/robot/aliases/stable").value(), latest);
+  ASSERT_TRUE(store_->Of(store::kDefaultTenant).models().SetAlias("robot", "stable", 2).ok());
+  EXPECT_EQ(cache.Get(store::kDefaultTenant, "f", "models/robot/aliases/stable").value(), latest);
 }
 
 TEST_F(ModelCacheTest, AnAdaptationIsItsBaseWithTheAdaptedSubset) {
   Add(1);
   Adapt("mine", 2);
   ModelCache cache(*store_, kAmple);
-  const auto base = cache.Get("f", "models/robot").value();
-  const auto adapted = cache.Get("f", "adaptations/mine").value();
+  const auto base = cache.Get(store::kDefaultTenant, "f", "models/robot").value();
+  const auto adapted = cache.Get(store::kDefaultTenant, "f", "adaptations/mine").value();
   EXPECT_EQ(adapted->model_version, "models/robot/versions/1");
   EXPECT_EQ(adapted->adaptation, "adaptations/mine");
   for (const nn::Tensor& tensor : base->bundle.model.layout().tensors()) {
@@ -71,11 +71,11 @@ TEST_F(ModelCacheTest, AnIdThatIsUsedAgainMeansTheNewAdaptation) {
   Add(1);
   Adapt("mine", 2);
   ModelCache cache(*store_, kAmple);
-  const auto old = cache.Get("f", "adaptations/mine").value();
-  ASSERT_TRUE(store_->adaptations().Delete("mine").ok());
-  EXPECT_EQ(cache.Get("f", "adaptations/mine").status().code(), absl::StatusCode::kNotFound);
+  const auto old = cache.Get(store::kDefaultTenant, "f", "adaptations/mine").value();
+  ASSERT_TRUE(store_->Of(store::kDefaultTenant).adaptations().Delete("mine").ok());
+  EXPECT_EQ(cache.Get(store::kDefaultTenant, "f", "adaptations/mine").status().code(), absl::StatusCode::kNotFound);
   Adapt("mine", 3);
-  EXPECT_NE(cache.Get("f", "adaptations/mine").value()->bundle.parameters, old->bundle.parameters);
+  EXPECT_NE(cache.Get(store::kDefaultTenant, "f", "adaptations/mine").value()->bundle.parameters, old->bundle.parameters);
 }
 
 TEST_F(ModelCacheTest, EqualArchitecturesShareTheirFilter) {
@@ -83,9 +83,9 @@ TEST_F(ModelCacheTest, EqualArchitecturesShareTheirFilter) {
   Add(2);
   AddVersion("state", nssm::WriteModelFile(TinyStateBundle()));
   ModelCache cache(*store_, kAmple);
-  const auto first = cache.Get("f", "models/robot/versions/1").value();
-  const auto second = cache.Get("f", "models/robot/versions/2").value();
-  const auto other = cache.Get("f", "models/state").value();
+  const auto first = cache.Get(store::kDefaultTenant, "f", "models/robot/versions/1").value();
+  const auto second = cache.Get(store::kDefaultTenant, "f", "models/robot/versions/2").value();
+  const auto other = cache.Get(store::kDefaultTenant, "f", "models/state").value();
   EXPECT_EQ(first->filter_model, second->filter_model);
   EXPECT_NE(first->filter_model, other->filter_model);
 }
@@ -94,13 +94,13 @@ TEST_F(ModelCacheTest, OverTheBudgetOnlyTheLatestAndThoseInUseStay) {
   Add(1);
   Add(2);
   ModelCache cache(*store_, /*budget_bytes=*/1);
-  std::weak_ptr<const ServedModel> first = cache.Get("f", "models/robot/versions/1").value();
+  std::weak_ptr<const ServedModel> first = cache.Get(store::kDefaultTenant, "f", "models/robot/versions/1").value();
   EXPECT_FALSE(first.expired());  // the latest
-  const auto second = cache.Get("f", "models/robot/versions/2").value();
+  const auto second = cache.Get(store::kDefaultTenant, "f", "models/robot/versions/2").value();
   EXPECT_TRUE(first.expired());
-  (void)cache.Get("f", "models/robot/versions/1").value();
+  (void)cache.Get(store::kDefaultTenant, "f", "models/robot/versions/1").value();
   // No longer the latest, but held here: not loaded again.
-  EXPECT_EQ(cache.Get("f", "models/robot/versions/2").value(), second);
+  EXPECT_EQ(cache.Get(store::kDefaultTenant, "f", "models/robot/versions/2").value(), second);
 }
 
 TEST_F(ModelCacheTest, ManyAtOnceGetOneModel) {
@@ -109,7 +109,7 @@ TEST_F(ModelCacheTest, ManyAtOnceGetOneModel) {
   std::vector<std::shared_ptr<const ServedModel>> models(8);
   std::vector<std::thread> threads;
   for (auto& model : models) {
-    threads.emplace_back([&] { model = cache.Get("f", "models/robot").value(); });
+    threads.emplace_back([&] { model = cache.Get(store::kDefaultTenant, "f", "models/robot").value(); });
   }
   for (std::thread& thread : threads) thread.join();
   for (const auto& model : models) EXPECT_EQ(model, models[0]);
@@ -119,12 +119,12 @@ TEST_F(ModelCacheTest, ErrorsAreToldApart) {
   AddVersion("broken", "this is no model file");
   Add(1);
   ModelCache cache(*store_, kAmple);
-  EXPECT_EQ(cache.Get("f", "robot").status().code(), absl::StatusCode::kInvalidArgument);
-  EXPECT_EQ(cache.Get("f", "models/none").status().code(), absl::StatusCode::kNotFound);
-  EXPECT_EQ(cache.Get("f", "adaptations/none").status().code(), absl::StatusCode::kNotFound);
-  EXPECT_EQ(cache.Get("f", "models/broken").status().code(), absl::StatusCode::kDataLoss);
-  FlipBit(store_->models().GetLatest("robot")->digest);
-  EXPECT_EQ(cache.Get("f", "models/robot").status().code(), absl::StatusCode::kDataLoss);
+  EXPECT_EQ(cache.Get(store::kDefaultTenant, "f", "robot").status().code(), absl::StatusCode::kInvalidArgument);
+  EXPECT_EQ(cache.Get(store::kDefaultTenant, "f", "models/none").status().code(), absl::StatusCode::kNotFound);
+  EXPECT_EQ(cache.Get(store::kDefaultTenant, "f", "adaptations/none").status().code(), absl::StatusCode::kNotFound);
+  EXPECT_EQ(cache.Get(store::kDefaultTenant, "f", "models/broken").status().code(), absl::StatusCode::kDataLoss);
+  FlipBit(store_->Of(store::kDefaultTenant).models().GetLatest("robot")->digest);
+  EXPECT_EQ(cache.Get(store::kDefaultTenant, "f", "models/robot").status().code(), absl::StatusCode::kDataLoss);
 }
 
 }  // namespace

@@ -18,7 +18,7 @@ class AdaptationsTest : public StoreTest {
     AddVersion("robot");
   }
   absl::StatusOr<Adaptation> Create(const std::string& id, const RequestId& request = {}) {
-    return store_->adaptations().Create(
+    return Mine().adaptations().Create(
         {id, "robot", 1, Blob("subset"), R"({"steps": 5})", request});
   }
 };
@@ -26,7 +26,7 @@ class AdaptationsTest : public StoreTest {
 TEST_F(AdaptationsTest, AnAdaptationIsReadBackAsItWasMade) {
   ASSERT_TRUE(Create("arm").ok());
   Reopen();
-  const auto adaptation = store_->adaptations().Get("arm");
+  const auto adaptation = Mine().adaptations().Get("arm");
   ASSERT_TRUE(adaptation.ok()) << adaptation.status();
   EXPECT_EQ(adaptation->id, "arm");
   EXPECT_EQ(adaptation->model, "robot");
@@ -35,14 +35,14 @@ TEST_F(AdaptationsTest, AnAdaptationIsReadBackAsItWasMade) {
   EXPECT_EQ(adaptation->size_bytes, 6);
   EXPECT_EQ(adaptation->receipt_json, R"({"steps": 5})");
   EXPECT_EQ(adaptation->create_time, now_);
-  EXPECT_EQ(store_->adaptations().ReadFile(*adaptation).value(), "subset");
+  EXPECT_EQ(Mine().adaptations().ReadFile(*adaptation).value(), "subset");
 }
 
 TEST_F(AdaptationsTest, ChoosesIdsThatAreFree) {
   ASSERT_TRUE(Create("a2").ok());
   EXPECT_EQ(Create("")->id, "a1");
   EXPECT_EQ(Create("")->id, "a3");
-  ASSERT_TRUE(store_->adaptations().Delete("a3").ok());
+  ASSERT_TRUE(Mine().adaptations().Delete("a3").ok());
   EXPECT_EQ(Create("")->id, "a4");
 }
 
@@ -53,21 +53,21 @@ TEST_F(AdaptationsTest, ATakenIdIsRefused) {
 
 TEST_F(AdaptationsTest, TheSameRequestMakesOneAdaptation) {
   const RequestId request{"id-1", "print"};
-  EXPECT_FALSE(store_->adaptations().FindByRequest(request)->has_value());
+  EXPECT_FALSE(Mine().adaptations().FindByRequest(request)->has_value());
   ASSERT_EQ(Create("", request)->id, "a1");
   EXPECT_EQ(Create("", request)->id, "a1");
-  EXPECT_EQ(store_->adaptations().FindByRequest(request)->value().id, "a1");
-  EXPECT_EQ(store_->adaptations().FindByRequest({"id-1", "other"}).status().code(),
+  EXPECT_EQ(Mine().adaptations().FindByRequest(request)->value().id, "a1");
+  EXPECT_EQ(Mine().adaptations().FindByRequest({"id-1", "other"}).status().code(),
             absl::StatusCode::kAlreadyExists);
 }
 
 TEST_F(AdaptationsTest, ListsByIdInPages) {
   for (const char* id : {"c", "a", "b"}) ASSERT_TRUE(Create(id).ok());
-  const auto first = store_->adaptations().List({2, ""});
+  const auto first = Mine().adaptations().List({2, ""});
   ASSERT_TRUE(first.ok());
   std::vector<std::string> ids;
   for (const auto& adaptation : first->items) ids.push_back(adaptation.id);
-  const auto second = store_->adaptations().List({2, first->next_page_token});
+  const auto second = Mine().adaptations().List({2, first->next_page_token});
   ASSERT_TRUE(second.ok());
   for (const auto& adaptation : second->items) ids.push_back(adaptation.id);
   EXPECT_THAT(ids, ElementsAre("a", "b", "c"));
@@ -75,27 +75,27 @@ TEST_F(AdaptationsTest, ListsByIdInPages) {
 
 TEST_F(AdaptationsTest, DeletingRemovesTheFile) {
   const auto adaptation = Create("arm");
-  ASSERT_TRUE(store_->adaptations().Delete("arm").ok());
+  ASSERT_TRUE(Mine().adaptations().Delete("arm").ok());
   EXPECT_FALSE(BlobExists(adaptation->digest));
-  EXPECT_EQ(store_->adaptations().Get("arm").status().code(), absl::StatusCode::kNotFound);
-  EXPECT_EQ(store_->adaptations().ReadFile(*adaptation).status().code(),
+  EXPECT_EQ(Mine().adaptations().Get("arm").status().code(), absl::StatusCode::kNotFound);
+  EXPECT_EQ(Mine().adaptations().ReadFile(*adaptation).status().code(),
             absl::StatusCode::kNotFound);
-  EXPECT_EQ(store_->adaptations().Delete("arm").code(), absl::StatusCode::kNotFound);
+  EXPECT_EQ(Mine().adaptations().Delete("arm").code(), absl::StatusCode::kNotFound);
 }
 
 TEST_F(AdaptationsTest, ADamagedFileIsDataLossThatNamesTheAdaptation) {
   const auto adaptation = Create("arm");
   FlipBit(adaptation->digest);
-  const absl::Status status = store_->adaptations().ReadFile(*adaptation).status();
+  const absl::Status status = Mine().adaptations().ReadFile(*adaptation).status();
   EXPECT_EQ(status.code(), absl::StatusCode::kDataLoss);
   EXPECT_THAT(std::string(status.message()), HasSubstr("adaptation 'arm'"));
 }
 
 TEST_F(AdaptationsTest, NeedsItsVersionAndAProperId) {
-  const auto lost = store_->adaptations().Create({"arm", "robot", 7, Blob("x"), "{}", {}});
+  const auto lost = Mine().adaptations().Create({"arm", "robot", 7, Blob("x"), "{}", {}});
   EXPECT_EQ(lost.status().code(), absl::StatusCode::kNotFound);
   EXPECT_EQ(Create("../arm").status().code(), absl::StatusCode::kInvalidArgument);
-  EXPECT_EQ(store_->adaptations().Get("../arm").status().code(),
+  EXPECT_EQ(Mine().adaptations().Get("../arm").status().code(),
             absl::StatusCode::kInvalidArgument);
 }
 

@@ -71,36 +71,36 @@ class Writer {
   void AddVersion() {
     const auto model = static_cast<int64_t>(rng_.Index(3));
     const auto version =
-        store_.models().AddVersion(ModelName(model), RandomBlob(200'000), "{}").value();
+        store_.Of(kDefaultTenant).models().AddVersion(ModelName(model), RandomBlob(200'000), "{}").value();
     Tell({Report::kAdded, model, version.version});
   }
 
   void DeleteVersion() {
     const auto model = static_cast<int64_t>(rng_.Index(3));
-    const auto latest = store_.models().GetLatest(ModelName(model));
+    const auto latest = store_.Of(kDefaultTenant).models().GetLatest(ModelName(model));
     if (!latest.ok()) return;
     Tell({Report::kDeleting, model, latest->version});
-    store_.models()
+    store_.Of(kDefaultTenant).models()
         .DeleteVersion(ModelName(model), latest->version)
         .IgnoreError();  // may be in use
   }
 
   void Adapt() {
-    const auto latest = store_.models().GetLatest("m0");
+    const auto latest = store_.Of(kDefaultTenant).models().GetLatest("m0");
     if (!latest.ok()) return;
-    const auto adaptation = store_.adaptations()
+    const auto adaptation = store_.Of(kDefaultTenant).adaptations()
                                 .Create({"", "m0", latest->version, RandomBlob(20'000), "{}", {}})
                                 .value();
-    if (rng_.Index(2) == 0) store_.adaptations().Delete(adaptation.id).IgnoreError();
+    if (rng_.Index(2) == 0) store_.Of(kDefaultTenant).adaptations().Delete(adaptation.id).IgnoreError();
   }
 
   void Train() {
-    if (!store_.jobs().Create({"trained", "{}", RandomBlob(100'000), {}}).ok()) _exit(3);
-    const auto job = store_.jobs().Claim("writer", absl::Seconds(30)).value();
-    const JobLease lease{job->number, job->attempt};
-    store_.jobs().WorkDirectory(job->number).value();
-    if (!store_.jobs().Renew(lease, absl::Seconds(30), "{}", true).ok()) _exit(4);
-    if (!store_.jobs().Publish(lease, RandomBlob(100'000), absl::StrCat(job->number)).ok())
+    if (!store_.Of(kDefaultTenant).jobs().Create({"trained", "{}", RandomBlob(100'000), {}}).ok()) _exit(3);
+    const auto job = store_.job_queue().Claim("writer", absl::Seconds(30)).value();
+    const JobLease lease = job->lease;
+    store_.job_queue().WorkDirectory(lease).value();
+    if (!store_.job_queue().Renew(lease, absl::Seconds(30), "{}", true).ok()) _exit(4);
+    if (!store_.job_queue().Publish(lease, RandomBlob(100'000), absl::StrCat(lease.number)).ok())
       _exit(5);
   }
 
@@ -111,7 +111,7 @@ class Writer {
 
 [[noreturn]] void RunWriter(const std::string& directory, uint64_t seed, int report_fd) {
   auto store = Store::Open(directory, Now);
-  if (!store.ok() || !(*store)->jobs().GiveBackAll().ok()) _exit(1);
+  if (!store.ok() || !(*store)->job_queue().GiveBackAll().ok()) _exit(1);
   Writer writer(**store, seed, report_fd);
   while (true) writer.Step();
 }
@@ -157,29 +157,31 @@ void RunAndKill(const std::string& directory, uint64_t seed, uint64_t reports,
 }
 
 std::vector<ModelVersion> AllVersions(Store& store, const std::string& model) {
-  const auto page = store.models().ListVersions(model, {1000, ""});
+  const auto page = store.Of(kDefaultTenant).models().ListVersions(model, {1000, ""});
   return page.ok() ? page->items : std::vector<ModelVersion>();
 }
 
 /// Every file is whole and belongs to a row; nothing else lies about.
 void CheckFiles(Store& store, const std::string& directory) {
-  EXPECT_THAT(store.TakeInventory(true)->problems, IsEmpty());
+  EXPECT_THAT(store.TakeInventory("", true)->problems, IsEmpty());
   EXPECT_THAT(*ListDirectory(directory + "/tmp"), IsEmpty());
   std::set<std::string> expected;
   std::set<std::string> with_directory;
   for (const char* model : {"m0", "m1", "m2", "trained"}) {
     for (const auto& version : AllVersions(store, model)) {
-      EXPECT_TRUE(store.models().ReadFile(version).ok());
+      EXPECT_TRUE(store.Of(kDefaultTenant).models().ReadFile(version).ok());
       expected.insert(version.digest);
     }
   }
-  const auto adaptations = store.adaptations().List({1000, ""}).value();
+  const auto adaptations = store.Of(kDefaultTenant).adaptations().List({1000, ""}).value();
   for (const auto& adaptation : adaptations.items) expected.insert(adaptation.digest);
-  const auto jobs = store.jobs().List({1000, ""}).value();
+  const auto jobs = store.Of(kDefaultTenant).jobs().List({1000, ""}).value();
   for (const auto& job : jobs.items) {
     const bool active = job.state == JobState::kQueued || job.state == JobState::kRunning;
     if (active) expected.insert(job.dataset_digest);
-    if (active || job.state == JobState::kFailed) with_directory.insert(absl::StrCat(job.number));
+    if (active || job.state == JobState::kFailed) {
+      with_directory.insert(JobDirectoryName(kDefaultTenant, job.number));
+    }
   }
   EXPECT_THAT(*ListDirectory(directory + "/blobs"), UnorderedElementsAreArray(expected));
   EXPECT_THAT(*ListDirectory(directory + "/jobs"), testing::IsSubsetOf(with_directory));
@@ -191,7 +193,7 @@ void CheckJobs(Store& store) {
   for (const auto& version : AllVersions(store, "trained")) {
     ++versions_of_job[version.metadata_json];
   }
-  const auto jobs = store.jobs().List({1000, ""}).value();
+  const auto jobs = store.Of(kDefaultTenant).jobs().List({1000, ""}).value();
   for (const auto& job : jobs.items) {
     EXPECT_EQ(versions_of_job[absl::StrCat(job.number)], job.state == JobState::kSucceeded)
         << job.number;
@@ -214,7 +216,8 @@ TEST(CrashTest, NothingConfirmedIsLostAndNothingHalfMadeIsLeft) {
     CheckJobs(**store);
     for (const auto& [model, versions] : confirmed) {
       for (const int64_t version : versions) {
-        EXPECT_TRUE((*store)->models().GetVersion(absl::StrCat("m", model), version).ok())
+        TenantStore mine = (*store)->Of(kDefaultTenant);
+        EXPECT_TRUE(mine.models().GetVersion(absl::StrCat("m", model), version).ok())
             << "m" << model << " version " << version;
       }
     }

@@ -24,10 +24,10 @@ std::vector<std::string> Names(const Page<Model>& page) {
 }
 
 TEST_F(ModelsTest, AVersionIsReadBackAsItWasAdded) {
-  const auto added = store_->models().AddVersion("robot", Blob("weights"), R"({"n": 3})");
+  const auto added = Mine().models().AddVersion("robot", Blob("weights"), R"({"n": 3})");
   ASSERT_TRUE(added.ok()) << added.status();
   Reopen();
-  const auto version = store_->models().GetVersion("robot", 1);
+  const auto version = Mine().models().GetVersion("robot", 1);
   ASSERT_TRUE(version.ok()) << version.status();
   EXPECT_EQ(version->model, "robot");
   EXPECT_EQ(version->version, 1);
@@ -35,16 +35,16 @@ TEST_F(ModelsTest, AVersionIsReadBackAsItWasAdded) {
   EXPECT_EQ(version->size_bytes, 7);
   EXPECT_EQ(version->metadata_json, R"({"n": 3})");
   EXPECT_EQ(version->create_time, now_);
-  EXPECT_EQ(store_->models().ReadFile(*version).value(), "weights");
+  EXPECT_EQ(Mine().models().ReadFile(*version).value(), "weights");
 }
 
 TEST_F(ModelsTest, AModelTellsItsVersionsAndAliases) {
   AddVersion("robot", "one");
   now_ += absl::Hours(1);
   AddVersion("robot", "two");
-  ASSERT_TRUE(store_->models().SetAlias("robot", "stable", 1).ok());
-  ASSERT_TRUE(store_->models().SetAlias("robot", "beta", 2).ok());
-  const auto model = store_->models().Get("robot");
+  ASSERT_TRUE(Mine().models().SetAlias("robot", "stable", 1).ok());
+  ASSERT_TRUE(Mine().models().SetAlias("robot", "beta", 2).ok());
+  const auto model = Mine().models().Get("robot");
   ASSERT_TRUE(model.ok()) << model.status();
   EXPECT_EQ(model->latest_version, 2);
   EXPECT_EQ(model->version_count, 2);
@@ -52,67 +52,67 @@ TEST_F(ModelsTest, AModelTellsItsVersionsAndAliases) {
   ASSERT_EQ(model->aliases.size(), 2);
   EXPECT_EQ(model->aliases[0].alias, "beta");
   EXPECT_EQ(model->aliases[1].version, 1);
-  EXPECT_EQ(store_->models().GetLatest("robot")->version, 2);
-  EXPECT_EQ(store_->models().GetByAlias("robot", "stable")->digest, Sha256Hex("one"));
+  EXPECT_EQ(Mine().models().GetLatest("robot")->version, 2);
+  EXPECT_EQ(Mine().models().GetByAlias("robot", "stable")->digest, Sha256Hex("one"));
 }
 
 TEST_F(ModelsTest, SettingAnAliasAgainMovesIt) {
   AddVersion("robot");
   AddVersion("robot");
-  ASSERT_TRUE(store_->models().SetAlias("robot", "stable", 1).ok());
-  ASSERT_TRUE(store_->models().SetAlias("robot", "stable", 2).ok());
-  EXPECT_EQ(store_->models().GetByAlias("robot", "stable")->version, 2);
-  ASSERT_TRUE(store_->models().DeleteAlias("robot", "stable").ok());
-  EXPECT_EQ(store_->models().GetByAlias("robot", "stable").status().code(),
+  ASSERT_TRUE(Mine().models().SetAlias("robot", "stable", 1).ok());
+  ASSERT_TRUE(Mine().models().SetAlias("robot", "stable", 2).ok());
+  EXPECT_EQ(Mine().models().GetByAlias("robot", "stable")->version, 2);
+  ASSERT_TRUE(Mine().models().DeleteAlias("robot", "stable").ok());
+  EXPECT_EQ(Mine().models().GetByAlias("robot", "stable").status().code(),
             absl::StatusCode::kNotFound);
 }
 
 TEST_F(ModelsTest, VersionNumbersAreNeverGivenTwice) {
   AddVersion("robot");
   AddVersion("robot");
-  ASSERT_TRUE(store_->models().DeleteVersion("robot", 2).ok());
+  ASSERT_TRUE(Mine().models().DeleteVersion("robot", 2).ok());
   EXPECT_EQ(AddVersion("robot").version, 3);
-  ASSERT_TRUE(store_->models().DeleteVersion("robot", 1).ok());
-  ASSERT_TRUE(store_->models().DeleteVersion("robot", 3).ok());
-  EXPECT_EQ(store_->models().Get("robot").status().code(), absl::StatusCode::kNotFound);
+  ASSERT_TRUE(Mine().models().DeleteVersion("robot", 1).ok());
+  ASSERT_TRUE(Mine().models().DeleteVersion("robot", 3).ok());
+  EXPECT_EQ(Mine().models().Get("robot").status().code(), absl::StatusCode::kNotFound);
   EXPECT_EQ(AddVersion("robot").version, 4);
 }
 
 TEST_F(ModelsTest, TheSameRequestMakesOneVersion) {
   const RequestId request{"id-1", "print"};
-  const auto first = store_->models().AddVersion("robot", Blob("w"), "{}", request);
+  const auto first = Mine().models().AddVersion("robot", Blob("w"), "{}", request);
   Reopen();
-  const auto again = store_->models().AddVersion("robot", Blob("w"), "{}", request);
+  const auto again = Mine().models().AddVersion("robot", Blob("w"), "{}", request);
   ASSERT_TRUE(again.ok()) << again.status();
   EXPECT_EQ(again->version, first->version);
-  EXPECT_EQ(store_->models().Get("robot")->version_count, 1);
+  EXPECT_EQ(Mine().models().Get("robot")->version_count, 1);
 }
 
 TEST_F(ModelsTest, ARequestIdIsForOneRequest) {
-  ASSERT_TRUE(store_->models().AddVersion("robot", Blob("w"), "{}", {"id-1", "print"}).ok());
-  const auto other = store_->models().AddVersion("robot", Blob("v"), "{}", {"id-1", "other"});
+  ASSERT_TRUE(Mine().models().AddVersion("robot", Blob("w"), "{}", {"id-1", "print"}).ok());
+  const auto other = Mine().models().AddVersion("robot", Blob("v"), "{}", {"id-1", "other"});
   EXPECT_EQ(other.status().code(), absl::StatusCode::kAlreadyExists);
   const auto too_long =
-      store_->models().AddVersion("robot", Blob("v"), "{}", {std::string(129, 'x'), "other"});
+      Mine().models().AddVersion("robot", Blob("v"), "{}", {std::string(129, 'x'), "other"});
   EXPECT_EQ(too_long.status().code(), absl::StatusCode::kInvalidArgument);
 }
 
 TEST_F(ModelsTest, ARequestIdIsForgottenAfterAWeek) {
-  ASSERT_TRUE(store_->models().AddVersion("robot", Blob("w"), "{}", {"id-1", "print"}).ok());
+  ASSERT_TRUE(Mine().models().AddVersion("robot", Blob("w"), "{}", {"id-1", "print"}).ok());
   now_ += absl::Hours(24 * 8);
-  ASSERT_TRUE(store_->models().AddVersion("robot", Blob("w"), "{}", {"id-2", "print"}).ok());
-  EXPECT_EQ(store_->models().AddVersion("robot", Blob("w"), "{}", {"id-1", "print"})->version, 3);
+  ASSERT_TRUE(Mine().models().AddVersion("robot", Blob("w"), "{}", {"id-2", "print"}).ok());
+  EXPECT_EQ(Mine().models().AddVersion("robot", Blob("w"), "{}", {"id-1", "print"})->version, 3);
 }
 
 TEST_F(ModelsTest, PagesHoldEveryModelOnceWhateverHappensInBetween) {
   for (const char* name : {"b", "d", "f", "h"}) AddVersion(name);
-  const auto first = store_->models().List({2, ""});
+  const auto first = Mine().models().List({2, ""});
   ASSERT_TRUE(first.ok());
   EXPECT_THAT(Names(*first), ElementsAre("b", "d"));
   AddVersion("a");  // before the place where the next page begins: not on it
   AddVersion("g");
-  ASSERT_TRUE(store_->models().DeleteVersion("d", 1).ok());
-  const auto second = store_->models().List({10, first->next_page_token});
+  ASSERT_TRUE(Mine().models().DeleteVersion("d", 1).ok());
+  const auto second = Mine().models().List({10, first->next_page_token});
   ASSERT_TRUE(second.ok());
   EXPECT_THAT(Names(*second), ElementsAre("f", "g", "h"));
   EXPECT_EQ(second->next_page_token, "");
@@ -123,7 +123,7 @@ TEST_F(ModelsTest, VersionsComeNewestFirstInPages) {
   std::vector<int64_t> numbers;
   std::string token;
   do {
-    const auto page = store_->models().ListVersions("robot", {2, token});
+    const auto page = Mine().models().ListVersions("robot", {2, token});
     ASSERT_TRUE(page.ok()) << page.status();
     for (const auto& version : page->items) numbers.push_back(version.version);
     token = page->next_page_token;
@@ -132,7 +132,7 @@ TEST_F(ModelsTest, VersionsComeNewestFirstInPages) {
 }
 
 TEST_F(ModelsTest, AListWithoutModelsIsEmpty) {
-  const auto page = store_->models().List({});
+  const auto page = Mine().models().List({});
   ASSERT_TRUE(page.ok());
   EXPECT_TRUE(page->items.empty());
   EXPECT_EQ(page->next_page_token, "");
@@ -140,44 +140,45 @@ TEST_F(ModelsTest, AListWithoutModelsIsEmpty) {
 
 TEST_F(ModelsTest, AVersionInUseIsNotDeleted) {
   AddVersion("robot");
-  ASSERT_TRUE(store_->models().SetAlias("robot", "stable", 1).ok());
-  absl::Status status = store_->models().DeleteVersion("robot", 1);
+  ASSERT_TRUE(Mine().models().SetAlias("robot", "stable", 1).ok());
+  absl::Status status = Mine().models().DeleteVersion("robot", 1);
   EXPECT_EQ(status.code(), absl::StatusCode::kFailedPrecondition);
   EXPECT_THAT(std::string(status.message()), HasSubstr("alias stable"));
-  ASSERT_TRUE(store_->models().DeleteAlias("robot", "stable").ok());
+  ASSERT_TRUE(Mine().models().DeleteAlias("robot", "stable").ok());
 
-  ASSERT_TRUE(store_->adaptations().Create({"arm", "robot", 1, Blob("subset"), "{}", {}}).ok());
-  status = store_->models().DeleteVersion("robot", 1);
+  ASSERT_TRUE(Mine().adaptations().Create({"arm", "robot", 1, Blob("subset"), "{}", {}}).ok());
+  status = Mine().models().DeleteVersion("robot", 1);
   EXPECT_EQ(status.code(), absl::StatusCode::kFailedPrecondition);
   EXPECT_THAT(std::string(status.message()), HasSubstr("adaptation arm"));
-  ASSERT_TRUE(store_->adaptations().Delete("arm").ok());
-  EXPECT_TRUE(store_->models().DeleteVersion("robot", 1).ok());
+  ASSERT_TRUE(Mine().adaptations().Delete("arm").ok());
+  EXPECT_TRUE(Mine().models().DeleteVersion("robot", 1).ok());
 }
 
 TEST_F(ModelsTest, AFileGoesWithTheLastVersionThatHasIt) {
   const auto one = AddVersion("robot", "same");
   AddVersion("other", "same");
-  ASSERT_TRUE(store_->models().DeleteVersion("robot", 1).ok());
+  ASSERT_TRUE(Mine().models().DeleteVersion("robot", 1).ok());
   EXPECT_TRUE(BlobExists(one.digest));
-  ASSERT_TRUE(store_->models().DeleteVersion("other", 1).ok());
+  ASSERT_TRUE(Mine().models().DeleteVersion("other", 1).ok());
   EXPECT_FALSE(BlobExists(one.digest));
 }
 
 TEST_F(ModelsTest, ADamagedFileIsDataLossThatNamesTheVersion) {
   const auto version = AddVersion("robot");
   FlipBit(version.digest);
-  absl::Status status = store_->models().ReadFile(version).status();
+  absl::Status status = Mine().models().ReadFile(version).status();
   EXPECT_EQ(status.code(), absl::StatusCode::kDataLoss);
   EXPECT_THAT(std::string(status.message()), HasSubstr("model 'robot' version 1"));
   std::filesystem::remove(store_->blobs().Path(version.digest));
-  status = store_->models().ReadFile(version).status();
+  status = Mine().models().ReadFile(version).status();
   EXPECT_EQ(status.code(), absl::StatusCode::kDataLoss);
   EXPECT_THAT(std::string(status.message()), HasSubstr("model 'robot' version 1"));
 }
 
 TEST_F(ModelsTest, WhatIsNotThereIsNotFound) {
   AddVersion("robot");
-  auto& models = store_->models();
+  TenantStore mine = Mine();
+  ModelStore& models = mine.models();
   const auto deleted = AddVersion("robot", "gone");
   ASSERT_TRUE(models.DeleteVersion("robot", 2).ok());
   for (const absl::Status& status :
@@ -192,7 +193,8 @@ TEST_F(ModelsTest, WhatIsNotThereIsNotFound) {
 
 TEST_F(ModelsTest, BadNamesAreInvalid) {
   AddVersion("robot");
-  auto& models = store_->models();
+  TenantStore mine = Mine();
+  ModelStore& models = mine.models();
   for (const absl::Status& status :
        {models.AddVersion("../x", Blob("w"), "{}").status(), models.Get("").status(),
         models.GetLatest("A").status(), models.GetVersion("a b", 1).status(),
@@ -214,9 +216,9 @@ TEST_F(ModelsTest, SharedFilesSurviveConcurrentDeletion) {
       const std::string model = absl::StrCat("m", t);
       for (int round = 0; round < kRounds; ++round) {
         const auto version = AddVersion(model, "shared");
-        const auto bytes = store_->models().ReadFile(version);
+        const auto bytes = Mine().models().ReadFile(version);
         EXPECT_TRUE(bytes.ok()) << bytes.status();
-        const absl::Status deleted = store_->models().DeleteVersion(model, version.version);
+        const absl::Status deleted = Mine().models().DeleteVersion(model, version.version);
         EXPECT_TRUE(deleted.ok()) << deleted;
       }
     });
@@ -234,7 +236,7 @@ TEST_F(ModelsTest, ConcurrentAdditionsGetDifferentNumbers) {
   }
   for (auto& thread : threads) thread.join();
   std::set<int64_t> numbers;
-  const auto versions = store_->models().ListVersions("robot", {}).value();
+  const auto versions = Mine().models().ListVersions("robot", {}).value();
   for (const auto& version : versions.items) numbers.insert(version.version);
   EXPECT_EQ(numbers.size(), 40);
   EXPECT_EQ(*numbers.rbegin(), 40);

@@ -14,7 +14,7 @@ using ::testing::Not;
 
 class SessionsTest : public StoreTest {
  protected:
-  SessionStore& sessions() { return store_->sessions(); }
+  SessionStore sessions() { return Mine().sessions(); }
   NewSession Create() { return sessions().Create("models/m/versions/1", "settings").value(); }
 };
 
@@ -37,7 +37,7 @@ TEST_F(SessionsTest, ANewSessionIsClaimed) {
 TEST_F(SessionsTest, ClaimingGivesTheLastCheckpointAndTheNextEpoch) {
   const NewSession created = Create();
   const std::string checkpoint("\0\x01state", 7);
-  ASSERT_THAT(sessions().SaveCheckpoints({{1, 1, 40, checkpoint}}).value(), ElementsAre(true));
+  ASSERT_THAT(store_->SaveCheckpoints({{kDefaultTenant, 1, 1, 40, checkpoint}}).value(), ElementsAre(true));
   Reopen();
   const auto claimed = sessions().Claim(1, created.token);
   ASSERT_TRUE(claimed.ok()) << claimed.status();
@@ -51,7 +51,7 @@ TEST_F(SessionsTest, WhoLostTheSessionWritesNothing) {
   Create();
   ASSERT_TRUE(sessions().Claim(1, first.token).ok());
   // One commit for both: the session that was taken over is told apart.
-  const auto written = sessions().SaveCheckpoints({{1, 1, 10, "old"}, {2, 1, 20, "mine"}});
+  const auto written = store_->SaveCheckpoints({{kDefaultTenant, 1, 1, 10, "old"}, {kDefaultTenant, 2, 1, 20, "mine"}});
   ASSERT_TRUE(written.ok()) << written.status();
   EXPECT_THAT(*written, ElementsAre(false, true));
   EXPECT_EQ(sessions().Get(1)->durable_seq, 0);
@@ -82,7 +82,7 @@ TEST_F(SessionsTest, ADeletedSessionIsGoneForGood) {
   EXPECT_EQ(sessions().Claim(1, created.token).status().code(), absl::StatusCode::kNotFound);
   EXPECT_EQ(sessions().Get(1).status().code(), absl::StatusCode::kNotFound);
   EXPECT_EQ(sessions().Delete(1).code(), absl::StatusCode::kNotFound);
-  EXPECT_THAT(sessions().SaveCheckpoints({{1, 1, 10, "x"}}).value(), ElementsAre(false));
+  EXPECT_THAT(store_->SaveCheckpoints({{kDefaultTenant, 1, 1, 10, "x"}}).value(), ElementsAre(false));
   EXPECT_EQ(Create().session.number, 2);
 }
 

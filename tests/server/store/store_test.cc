@@ -57,7 +57,7 @@ TEST(StoreOpenTest, AnotherFormatIsRefused) {
     ASSERT_TRUE(
         database->Write([](Connection& c) { return c.Execute("PRAGMA user_version = 99"); }).ok());
   }
-  ExpectRefused(TryOpen(directory.path()), "has format 99, this server knows format 1");
+  ExpectRefused(TryOpen(directory.path()), "has format 99, this server knows format 2");
 }
 
 TEST(StoreOpenTest, SomeoneElsesDatabaseIsRefused) {
@@ -108,12 +108,12 @@ TEST_F(StoreTest, TheInventoryCountsEverything) {
   AddVersion("robot", "12345");
   AddVersion("robot", "123");
   AddVersion("plant", "1");
-  ASSERT_TRUE(store_->adaptations().Create({"a", "plant", 1, Blob("12"), "{}", {}}).ok());
-  for (int i = 0; i < 6; ++i) ASSERT_TRUE(store_->jobs().Create({"m", "{}", Blob("d"), {}}).ok());
-  for (int i = 0; i < 3; ++i) ASSERT_TRUE(store_->jobs().Claim("w", absl::Seconds(1)).ok());
-  ASSERT_TRUE(store_->jobs().Cancel(1).ok());
-  ASSERT_TRUE(store_->sessions().Create("models/robot/versions/1", "").ok());
-  const auto inventory = store_->TakeInventory(true);
+  ASSERT_TRUE(Mine().adaptations().Create({"a", "plant", 1, Blob("12"), "{}", {}}).ok());
+  for (int i = 0; i < 6; ++i) ASSERT_TRUE(Mine().jobs().Create({"m", "{}", Blob("d"), {}}).ok());
+  for (int i = 0; i < 3; ++i) ASSERT_TRUE(store_->job_queue().Claim("w", absl::Seconds(1)).ok());
+  ASSERT_TRUE(Mine().jobs().Cancel(1).ok());
+  ASSERT_TRUE(Mine().sessions().Create("models/robot/versions/1", "").ok());
+  const auto inventory = store_->TakeInventory("", true);
   ASSERT_TRUE(inventory.ok()) << inventory.status();
   EXPECT_EQ(inventory->format_version, kFormatVersion);
   EXPECT_EQ(inventory->models, 2);
@@ -130,12 +130,53 @@ TEST_F(StoreTest, TheInventoryCountsEverything) {
 
 TEST_F(StoreTest, TheInventoryNamesDamagedAndMissingFiles) {
   FlipBit(AddVersion("robot", "flipped").digest);
-  ASSERT_TRUE(store_->adaptations().Create({"arm", "robot", 1, Blob("gone"), "{}", {}}).ok());
+  ASSERT_TRUE(Mine().adaptations().Create({"arm", "robot", 1, Blob("gone"), "{}", {}}).ok());
   std::filesystem::remove(store_->blobs().Path(Sha256Hex("gone")));
   // A glance sees only that a file is gone.
-  EXPECT_THAT(store_->TakeInventory(false)->problems, ElementsAre(StartsWith("adaptation 'arm'")));
-  EXPECT_THAT(store_->TakeInventory(true)->problems,
+  EXPECT_THAT(store_->TakeInventory("", false)->problems, ElementsAre(StartsWith("adaptation 'arm'")));
+  EXPECT_THAT(store_->TakeInventory("", true)->problems,
               ElementsAre(StartsWith("model 'robot' version 1"), StartsWith("adaptation 'arm'")));
+}
+
+// Format 1 had no tokens and no audit log, and named directories of jobs by their number.
+TEST_F(StoreTest, ADirectoryOfFormatOneIsBroughtUpToDate) {
+  const auto version = AddVersion("robot");
+  ASSERT_TRUE(Mine().jobs().Create({"m", "{}", Blob("d"), {}}).ok());
+  store_.reset();
+  {
+    auto database = Database::Open(directory_.path() + "/metaekf.db").value();
+    ASSERT_TRUE(database
+                    ->Write([](Connection& c) -> absl::Status {
+                      for (const char* table : {"tokens", "audit"}) {
+                        if (absl::Status s = c.Execute(absl::StrCat("DROP TABLE ", table)); !s.ok())
+                          return s;
+                      }
+                      return c.Execute("PRAGMA user_version = 1");
+                    })
+                    .ok());
+  }
+  std::filesystem::create_directory(directory_.path() + "/jobs/1");
+  std::ofstream(directory_.path() + "/jobs/1/checkpoint") << "kept";
+  Reopen();
+  EXPECT_EQ(store_->TakeInventory("", true)->format_version, kFormatVersion);
+  EXPECT_EQ(Mine().models().GetLatest("robot")->digest, version.digest);
+  const auto claimed = store_->job_queue().Claim("w", absl::Seconds(1)).value();
+  const std::string work = store_->job_queue().WorkDirectory(claimed->lease).value();
+  EXPECT_EQ(ReadFile(work + "/checkpoint").value(), "kept");
+  EXPECT_TRUE(store_->Tokens().Create("a", Scope::kRead, absl::InfiniteDuration(), "").ok());
+}
+
+TEST_F(StoreTest, TenantsDoNotSeeEachOthersThings) {
+  AddVersion("robot", "12345");
+  TenantStore other = store_->Of("other");
+  EXPECT_EQ(other.models().GetLatest("robot").status().code(), absl::StatusCode::kNotFound);
+  EXPECT_THAT(other.models().List({})->items, IsEmpty());
+  // The same names again, and the same bytes.
+  EXPECT_EQ(other.models().AddVersion("robot", Blob("12345"), "{}")->version, 1);
+  ASSERT_TRUE(other.models().DeleteVersion("robot", 1).ok());
+  EXPECT_EQ(Mine().models().ReadFile(*Mine().models().GetLatest("robot")).value(), "12345");
+  EXPECT_EQ(store_->TakeInventory("other", false)->versions, 0);
+  EXPECT_EQ(store_->TakeInventory(kDefaultTenant, false)->versions, 1);
 }
 
 TEST_F(StoreTest, AFullDiskStopsNothingForGood) {
@@ -145,12 +186,12 @@ TEST_F(StoreTest, AFullDiskStopsNothingForGood) {
     FileSizeLimit limit(1000);
     EXPECT_EQ(store_->blobs().Stage(big).status().code(), absl::StatusCode::kResourceExhausted);
     // The row does not fit either.
-    EXPECT_EQ(store_->sessions().Create("t", big).status().code(),
+    EXPECT_EQ(Mine().sessions().Create("t", big).status().code(),
               absl::StatusCode::kResourceExhausted);
-    EXPECT_TRUE(store_->models().GetLatest("robot").ok());
+    EXPECT_TRUE(Mine().models().GetLatest("robot").ok());
   }
   EXPECT_EQ(AddVersion("robot", big).version, 2);
-  EXPECT_THAT(store_->TakeInventory(true)->problems, IsEmpty());
+  EXPECT_THAT(store_->TakeInventory("", true)->problems, IsEmpty());
 }
 
 }  // namespace

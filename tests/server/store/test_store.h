@@ -61,10 +61,12 @@ class StoreTest : public testing::Test {
     store_ = *std::move(store);
   }
 
+  TenantStore Mine() { return store_->Of(kDefaultTenant); }
+
   StagedBlob Blob(const std::string& bytes) { return store_->blobs().Stage(bytes).value(); }
 
   ModelVersion AddVersion(const std::string& model, const std::string& bytes = "weights") {
-    return store_->models().AddVersion(model, Blob(bytes), "{}").value();
+    return Mine().models().AddVersion(model, Blob(bytes), "{}").value();
   }
 
   bool BlobExists(const std::string& digest) {

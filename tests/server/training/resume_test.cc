@@ -37,7 +37,7 @@ class ResumeTest : public ServerTest {
   }
   /// Waits until a worker has written its first checkpoint.
   void AwaitCheckpoint(int64_t job) {
-    const std::string path = directory_.path() + "/jobs/" + std::to_string(job) + "/checkpoint";
+    const std::string path = directory_.path() + "/jobs/default-" + std::to_string(job) + "/checkpoint";
     while (!std::filesystem::exists(path)) std::this_thread::yield();
   }
 };
@@ -83,7 +83,7 @@ TEST_F(ResumeTest, ADamagedCheckpointIsPassedOver) {
   ASSERT_TRUE(client_->CreateJob(TinyJob("damaged", kIterations)).ok());
   AwaitCheckpoint(2);
   Stop();
-  std::ofstream(directory_.path() + "/jobs/2/checkpoint") << "no checkpoint";
+  std::ofstream(directory_.path() + "/jobs/default-2/checkpoint") << "no checkpoint";
   Start();
   EXPECT_EQ(WatchToTheEnd("jobs/2").state(), v1::Job::SUCCEEDED);
   EXPECT_EQ(Digest("models/damaged"), Digest("models/undisturbed"));
