@@ -7,7 +7,7 @@
 #include "core/base/status.h"
 #include "core/data/split.h"
 #include "core/experiments/jobs.h"
-#include "core/filter/draw.h"
+#include "core/filter/believed_errors.h"
 #include "core/meta/adapt.h"
 
 namespace metaekf::experiments {
@@ -76,19 +76,30 @@ absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const st
   return run;
 }
 
-absl::StatusOr<data::Trajectory> AsFilterBelieves(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,
-                                                  data::Trajectory recording, int64_t from, base::Rng* rng) {
+absl::StatusOr<std::vector<double>> CoverageByChance(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,
+                                                     const data::Trajectory& recording, int64_t from, double width, int draws, const base::Rng& rng) {
   const std::unique_ptr<filter::FilterModel::Scratch> scratch = functions->MakeScratch();
   METAEKF_ASSIGN_OR_RETURN(filter::Ekf ekf, FilterBefore(model, functions, recording, from, {}, scratch.get()));
   filter::Estimate estimate = ekf.MakeEstimate();
-  METAEKF_RETURN_IF_ERROR(ekf.Step(recording.inputs.col(from), recording.outputs.col(from), scratch.get(), &estimate));
-  const Index rest = recording.length() - from - 1;
-  METAEKF_ASSIGN_OR_RETURN(const filter::Future future, filter::Draw(ekf, recording.inputs.rightCols(rest), rng, scratch.get()));
-  if (model.model.spec().is_case_one()) recording.states = recording.outputs;
-  recording.states.col(from) = future.now;
-  recording.states.rightCols(rest) = future.truth;
-  recording.outputs.rightCols(rest) = future.outputs;
-  return recording;
+  filter::StepTrace trace;
+  ekf.set_trace(&trace);
+  filter::BelievedErrors believed(draws, rng);
+  const bool case_one = model.model.spec().is_case_one();
+  const Index n = estimate.mean.size(), all = ekf.joint().size();
+  VectorXd h(n), held = VectorXd::Zero(draws);
+  // What is estimated, in terms of what is followed: x, or the outputs.
+  MatrixXd H = MatrixXd::Identity(n, all);
+  for (Index t = from; t < recording.length(); ++t) {
+    METAEKF_RETURN_IF_ERROR(ekf.Step(recording.inputs.col(t), recording.outputs.col(t), scratch.get(), &estimate));
+    believed.Follow(ekf, trace);
+    if (case_one) ekf.joint().Measurement(ekf.state().mean, ekf.state().last_input, &h, &H, scratch.get());
+    const VectorXd bounds = width * (H * ekf.state().factor).rowwise().norm();
+    for (int draw = 0; draw < draws; ++draw) {
+      held[draw] += ((H * believed.errors().col(draw)).array().abs() <= bounds.array()).cast<double>().mean();
+    }
+  }
+  held /= static_cast<double>(recording.length() - from);
+  return std::vector<double>(held.begin(), held.end());
 }
 
 double Coverage(const FilterRun& run, const MatrixXd& errors, double width) {

@@ -34,11 +34,10 @@ absl::StatusOr<nssm::Bundle> AdaptForFilter(const nssm::Bundle& model, const dat
 absl::StatusOr<FilterRun> FilterAfterContext(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,
                                              const data::Trajectory& recording, int64_t from, filter::FilterOptions options = {});
 
-/// The recording as it might have been if the filter that FilterAfterContext runs were right about everything: drawn once it has seen
-/// sample `from`, the first that it estimates (filter::Draw). States are what the filter estimates, in Case I too (outputs without their noise).
-/// Arguments and errors as those of FilterAfterContext.
-absl::StatusOr<data::Trajectory> AsFilterBelieves(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,
-                                                  data::Trajectory recording, int64_t from, base::Rng* rng);
+/// What bounds of ± `width` standard deviations of the filter that FilterAfterContext runs would hold if it were right about its errors
+/// (filter::BelievedErrors): of each of `draws`, the share. Other arguments and errors as those of FilterAfterContext.
+absl::StatusOr<std::vector<double>> CoverageByChance(const nssm::Bundle& model, const std::shared_ptr<const filter::FilterModel>& functions,
+                                                     const data::Trajectory& recording, int64_t from, double width, int draws, const base::Rng& rng);
 
 /// Share of the errors that bounds of ± `width` standard deviations hold. @param errors  of the means.
 double Coverage(const FilterRun& run, const Eigen::MatrixXd& errors, double width);

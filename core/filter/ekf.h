@@ -86,7 +86,6 @@ struct NextSampleOf {
 };
 
 class Ekf;
-struct Future;
 using NextSample = NextSampleOf<Ekf>;
 
 /// Ekf::Step of filters on one FilterModel, which reads weights that they share once. What a filter does is to the bit what it does alone.
@@ -153,6 +152,7 @@ class Ekf {
   /// Errors: InvalidArgument if a sample's sizes are not n_u and n_y.
   absl::Status CheckSizes(Eigen::Index inputs, Eigen::Index outputs) const;
   int32_t estimate_size() const { return case_one_ ? output_size_ : model_size_; }
+  const JointModel& joint() const { return joint_; }
   const Eigen::MatrixXd& process_factor() const { return process_factor_; }
   bool projects() const { return projection_ != Projection::kNone; }
   /// The set of the state in normalised units; null without one.
@@ -164,7 +164,6 @@ class Ekf {
 
  private:
   friend void StepTogether(std::span<NextSample> samples, FilterModel::Scratch* scratch);
-  friend absl::StatusOr<Future> Draw(const Ekf& ekf, const Eigen::MatrixXd& inputs, base::Rng* rng, FilterModel::Scratch* scratch);
   Ekf() = default;
 
   // The parts of a step, between which a function of the model is evaluated.

@@ -1,7 +1,7 @@
+metaekf_test(core/filter/believed_errors_test.cc DEPS metaekf::core_filter)
 metaekf_test(core/filter/calibrate_test.cc LABELS slow DEPS metaekf::core_filter)
 metaekf_test(core/filter/chi_squared_test.cc DEPS metaekf::core_filter)
 metaekf_test(core/filter/constrain_test.cc DEPS metaekf::core_filter)
-metaekf_test(core/filter/draw_test.cc DEPS metaekf::core_filter)
 metaekf_test(core/filter/ekf_constraint_test.cc LABELS slow DEPS metaekf::core_filter)
 metaekf_test(core/filter/ekf_gate_test.cc DEPS metaekf::core_filter)
 metaekf_test(core/filter/ekf_test.cc DEPS metaekf::core_filter)
