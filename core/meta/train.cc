@@ -131,8 +131,12 @@ void FindOwnNoise(const Bundle& bundle, const AdaptationOptions& options, const 
     for (const nssm::FilterNoise& found : *noises) {
       own.noise = found;
       of_systems[i].push_back(filter::Explain(own, {runs[i]}, base::CallingThread()));
+      if (std::isfinite(of_systems[i].back().likelihood)) continue;
+      of_systems[i].clear();  // a filter that loses the system says nothing of the others
+      return;
     }
   });
+  noise->log_std = 0;  // where none says anything
   double most = -std::numeric_limits<double>::infinity(), of_fleet = 0;
   for (size_t c = 0; c < candidates.size(); ++c) {
     double sum = 0;
