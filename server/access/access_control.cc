@@ -22,8 +22,7 @@ absl::StatusOr<Caller> AccessControl::Identify(const Credentials& credentials) c
   if (!require_tokens_) return Caller{store::kDefaultTenant, "local", store::Scope::kAdmin};
   if (!credentials.authorization) {
     return absl::UnauthenticatedError(
-        "this server wants a token: send the metadata 'authorization: Bearer TOKEN' (metaekf: "
-        "--token-file FILE, or METAEKF_TOKEN)");
+        "this server wants a token: send the metadata 'authorization: Bearer TOKEN'");
   }
   absl::string_view secret = *credentials.authorization;
   if (!absl::ConsumePrefix(&secret, "Bearer ")) {

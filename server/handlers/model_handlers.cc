@@ -77,14 +77,7 @@ absl::StatusOr<store::ModelVersion> ResolveVersion(store::ModelStore& models,
                                                    const std::string& field,
                                                    const std::string& name) {
   METAEKF_ASSIGN_OR_RETURN(const Target target, ParseModelTarget(field, name));
-  switch (target.kind) {
-    case Target::Kind::kVersion:
-      return models.GetVersion(target.model, target.version);
-    case Target::Kind::kAlias:
-      return models.GetByAlias(target.model, target.alias);
-    default:
-      return models.GetLatest(target.model);
-  }
+  return ResolveTarget(models, target);
 }
 
 }  // namespace metaekf::server

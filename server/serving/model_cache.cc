@@ -22,7 +22,14 @@ absl::Status AsDataLoss(const absl::Status& status, const std::string& owner) {
       absl::StrCat(owner, ": the stored file cannot be used: ", std::string(status.message())));
 }
 
-absl::StatusOr<store::ModelVersion> Resolve(store::ModelStore& models, const Target& target) {
+template <class T>
+void EraseExpired(std::map<std::string, std::weak_ptr<T>>& map) {
+  std::erase_if(map, [](const auto& entry) { return entry.second.expired(); });
+}
+
+}  // namespace
+
+absl::StatusOr<store::ModelVersion> ResolveTarget(store::ModelStore& models, const Target& target) {
   switch (target.kind) {
     case Target::Kind::kVersion:
       return models.GetVersion(target.model, target.version);
@@ -33,20 +40,13 @@ absl::StatusOr<store::ModelVersion> Resolve(store::ModelStore& models, const Tar
   }
 }
 
-template <class T>
-void EraseExpired(std::map<std::string, std::weak_ptr<T>>& map) {
-  std::erase_if(map, [](const auto& entry) { return entry.second.expired(); });
-}
-
-}  // namespace
-
 absl::StatusOr<ModelCache::Model> ModelCache::Get(const std::string& tenant,
                                                   const std::string& field,
                                                   const std::string& name) {
   METAEKF_ASSIGN_OR_RETURN(const Target target, ParseTarget(field, name));
   store::TenantStore store = store_.Of(tenant);
   if (target.kind == Target::Kind::kAdaptation) return GetAdaptation(store, target.adaptation);
-  METAEKF_ASSIGN_OR_RETURN(const store::ModelVersion version, Resolve(store.models(), target));
+  METAEKF_ASSIGN_OR_RETURN(const store::ModelVersion version, ResolveTarget(store.models(), target));
   return GetVersion(store, version);
 }
 

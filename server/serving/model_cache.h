@@ -25,6 +25,9 @@ struct ServedModel {
   std::string adaptation;     ///< adaptations/{adaptation}; empty: as meta-trained
 };
 
+/// The version that a target which is no adaptation means now. Errors: NotFound.
+absl::StatusOr<store::ModelVersion> ResolveTarget(store::ModelStore& models, const Target& target);
+
 /// Loads models and adaptations from the store when they are asked for, and keeps those used last.
 ///
 /// Every call looks up what the name means now; contents are cached by digest, so that an answer is

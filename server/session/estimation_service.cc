@@ -37,7 +37,7 @@ absl::Status Draining(uint64_t durable_seq) {
 /// applied without it.
 class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse> {
  public:
-  EstimateStream(EstimationService* service, grpc::CallbackServerContext* context, CallContext caller)
+  EstimateStream(EstimationService* service, grpc::CallbackServerContext* context, Caller caller)
       : service_(*service), context_(context), caller_(std::move(caller)) {}
 
   void Start(bool draining) {
@@ -202,12 +202,13 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
 
   absl::Status OpenOrResume() {
     absl::StatusOr<std::shared_ptr<LiveSession>> live;
+    store::TenantStore mine = service_.server_.store.Of(caller_.tenant, caller_.identity);
     switch (work_.kind_case()) {
       case v1::EstimateRequest::kOpen:
-        live = service_.sessions_.Open(caller_.store, work_.open());
+        live = service_.sessions_.Open(mine, work_.open());
         break;
       case v1::EstimateRequest::kResume:
-        live = service_.sessions_.Resume(caller_.store, work_.resume());
+        live = service_.sessions_.Resume(mine, work_.resume());
         break;
       default:
         return FieldViolation("kind", "the first request must open or resume a session");
@@ -269,7 +270,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
 
   EstimationService& service_;
   grpc::CallbackServerContext* const context_;
-  CallContext caller_;
+  const Caller caller_;  // and not what its tenant has: streams are many, and need it once
   v1::EstimateRequest request_;    // being read, or waiting
   v1::EstimateRequest work_;       // being worked on
   v1::EstimateResponse response_;  // being made or written
@@ -304,8 +305,8 @@ EstimationService::~EstimationService() {
 grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse>* EstimationService::Estimate(
     grpc::CallbackServerContext* context) {
   using Reactor = grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse>;
-  return Admitted<Reactor>(context, server_, store::Scope::kStream, [&](CallContext caller) {
-    auto* stream = new EstimateStream(this, context, std::move(caller));
+  return Admitted<Reactor>(context, server_, store::Scope::kStream, [&](CallContext admitted) {
+    auto* stream = new EstimateStream(this, context, std::move(admitted.caller));
     bool draining;
     {
       std::lock_guard lock(mutex_);
