@@ -8,8 +8,10 @@
 #include <optional>
 #include <string>
 
+#include "absl/time/clock.h"
 #include "server/config/read_config.h"
 #include "server/server.h"
+#include "server/store/store.h"
 #include "server/training/worker.h"
 
 namespace {
@@ -25,6 +27,15 @@ struct Flags {
   std::optional<std::string> data_directory;
   std::optional<std::string> listen;
   bool insecure = false;
+  bool require_tokens = false;
+};
+
+/// Of the first token of a directory: there is nobody yet who could ask a server for one.
+struct NewTokenFlags {
+  std::string data_directory;
+  std::string tenant = metaekf::store::kDefaultTenant;
+  std::string scope;
+  std::string note;
 };
 
 int Fail(const absl::Status& status) {
@@ -51,6 +62,7 @@ int Serve(const Flags& flags) {
   if (flags.data_directory) options.data_directory = *flags.data_directory;
   if (flags.listen) options.listen = *flags.listen;
   options.insecure = flags.insecure;
+  if (flags.require_tokens) options.security.require_tokens = true;
   if (options.data_directory.empty()) {
     return Fail(absl::InvalidArgumentError(
         "where to keep the data is not said: give --data-dir DIR, or data_directory in the "
@@ -72,6 +84,21 @@ int Serve(const Flags& flags) {
   return 0;
 }
 
+int CreateToken(const NewTokenFlags& flags) {
+  using metaekf::store::Store;
+  const auto scope = metaekf::store::ScopeNamed(flags.scope);
+  if (!scope.ok()) return Fail(scope.status());
+  const auto store = Store::Open(flags.data_directory, [] { return absl::Now(); });
+  if (!store.ok()) return Fail(store.status());
+  const auto made = (*store)->Tokens("metaekfd create-token")
+                        .Create(flags.tenant, *scope, absl::InfiniteDuration(), flags.note);
+  if (!made.ok()) return Fail(made.status());
+  std::cerr << "token " << made->token.id << " of tenant " << made->token.tenant << ", scope "
+            << flags.scope << "; the secret is not kept, this is the only time that it is shown:\n";
+  std::cout << made->secret << std::endl;
+  return 0;
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -79,6 +106,8 @@ int main(int argc, char** argv) {
   spdlog::set_pattern("%Y-%m-%dT%H:%M:%S.%f%z level=%l pid=%P %v");
   // A reader that went away is an error of the write, not the end of the server.
   signal(SIGPIPE, SIG_IGN);
+  // Nor is a limit on the size of files.
+  signal(SIGXFSZ, SIG_IGN);
 
   CLI::App app("metaekfd: meta-learned state-space models and EKF estimates as a gRPC service");
   Flags flags;
@@ -86,6 +115,17 @@ int main(int argc, char** argv) {
   app.add_option("--listen", flags.listen, "HOST:PORT; port 0 picks one (default 127.0.0.1:50051)");
   app.add_option("--config", flags.config, "configuration (see deploy/metaekfd.textproto)");
   app.add_flag("--insecure", flags.insecure, "allow an address beyond loopback, unencrypted");
+  app.add_flag("--require-tokens", flags.require_tokens,
+               "every call must show a bearer token (create-token makes the first)");
+
+  NewTokenFlags new_token;
+  CLI::App* token_command =
+      app.add_subcommand("create-token", "make a bearer token while no server runs on the directory");
+  token_command->add_option("--data-dir", new_token.data_directory, "the server's")->required();
+  token_command->add_option("--tenant", new_token.tenant, "whose things its holder works with")
+      ->capture_default_str();
+  token_command->add_option("--scope", new_token.scope, "read, stream, write or admin")->required();
+  token_command->add_option("--note", new_token.note, "for whom it is");
 
   WorkerOptions worker;
   CLI::App* worker_command = app.add_subcommand("worker")->group("");  // for the server itself
@@ -104,5 +144,6 @@ int main(int argc, char** argv) {
     signal(SIGPIPE, SIG_DFL);
     return metaekf::server::RunWorker(worker);
   }
+  if (token_command->parsed()) return CreateToken(new_token);
   return Serve(flags);
 }

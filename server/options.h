@@ -3,8 +3,11 @@
 #include <cstddef>
 #include <cstdint>
 #include <string>
+#include <vector>
 
 #include "absl/time/time.h"
+#include "server/store/quota.h"
+#include "server/store/scope.h"
 
 namespace metaekf::server {
 
@@ -12,13 +15,30 @@ namespace metaekf::server {
 struct ServerOptions {
   std::string data_directory;
   std::string listen = "127.0.0.1:50051";
-  bool insecure = false;  ///< listens beyond loopback although nothing is encrypted
-  bool require_tokens = false;  ///< else whoever reaches the server may do everything
+  std::string metrics_listen;  ///< of Prometheus' metrics; empty: nowhere
+  bool insecure = false;  ///< listens beyond loopback whatever `security` says
 
   int64_t model_cache_bytes = int64_t{512} << 20;
   size_t io_threads = 4;
   size_t compute_threads = 0;  ///< 0: half the cores, at least 1
   absl::Duration drain_timeout = absl::Seconds(10);
+
+  struct Security {
+    std::string certificate_file;  ///< and key_file; empty: nothing is encrypted
+    std::string key_file;
+    std::string client_ca_file;   ///< clients must show a certificate that one of these signed
+    bool require_tokens = false;  ///< every call must show a bearer token
+    struct Client {
+      std::string certificate_name;
+      std::string tenant;
+      store::Scope scope = store::Scope::kRead;
+    };
+    std::vector<Client> clients;       ///< who may call with a certificate alone
+    std::vector<std::string> proxies;  ///< addresses that connections are taken from; empty: any
+    absl::Duration max_connection_age = absl::Hours(1);
+  } security;
+
+  store::Quotas quotas;
 
   struct Training {
     size_t concurrent_jobs = 1;

@@ -14,48 +14,20 @@
 #include <thread>
 #include <vector>
 
-#include "absl/strings/numbers.h"
 #include "absl/strings/str_cat.h"
 #include "absl/time/clock.h"
 #include "core/base/status.h"
+#include "server/access/exposure.h"
+#include "server/gauges.h"
+#include "server/handlers/call_record.h"
 #include "server/handlers/services.h"
 #include "server/keep_warm.h"
+#include "server/metrics/metrics_port.h"
 #include "server/session/estimation_service.h"
+#include "server/tls_credentials.h"
 
 namespace metaekf::server {
 namespace {
-
-/// HOST:PORT taken apart; HOST may be an IPv6 address in brackets.
-struct Address {
-  std::string host;
-  int port = 0;
-};
-
-absl::StatusOr<Address> ParseAddress(const std::string& text) {
-  const size_t colon = text.rfind(':');
-  Address address;
-  if (colon == std::string::npos || colon == 0 ||
-      !absl::SimpleAtoi(text.substr(colon + 1), &address.port) || address.port < 0 ||
-      address.port > 65535) {
-    return absl::InvalidArgumentError(
-        absl::StrCat("'", text, "' is not an address of the form HOST:PORT"));
-  }
-  address.host = text.substr(0, colon);
-  return address;
-}
-
-bool IsLoopback(const std::string& host) {
-  return host == "localhost" || host == "[::1]" || host.rfind("127.", 0) == 0;
-}
-
-absl::StatusOr<Address> CheckAddress(const ServerOptions& options) {
-  METAEKF_ASSIGN_OR_RETURN(Address address, ParseAddress(options.listen));
-  if (options.insecure || IsLoopback(address.host)) return address;
-  return absl::InvalidArgumentError(absl::StrCat(
-      "refusing to listen on ", options.listen,
-      ": connections are not encrypted yet, so others could read and change what is sent; listen "
-      "on 127.0.0.1, or say --insecure on a network that you trust"));
-}
 
 size_t MemoryQuota(int64_t configured) {
   if (configured > 0) return static_cast<size_t>(configured);
@@ -66,6 +38,8 @@ size_t MemoryQuota(int64_t configured) {
 size_t ComputeThreads(size_t configured) {
   return configured > 0 ? configured : std::max(1U, std::thread::hardware_concurrency() / 2);
 }
+
+constexpr absl::Duration kFarewell = absl::Milliseconds(500);
 
 /// The defaults of gRPC are easy to exhaust from outside.
 void SetLimits(const ServerOptions::Limits& limits, grpc::ServerBuilder& builder) {
@@ -90,6 +64,12 @@ void SetLimits(const ServerOptions::Limits& limits, grpc::ServerBuilder& builder
   set(GRPC_ARG_ALLOW_REUSEPORT, 0);
 }
 
+absl::StatusOr<std::shared_ptr<grpc::ServerCredentials>> MakeCredentials(
+    const ServerOptions::Security& security) {
+  if (security.certificate_file.empty()) return grpc::InsecureServerCredentials();
+  return TlsCredentials({security.certificate_file, security.key_file, security.client_ca_file});
+}
+
 }  // namespace
 
 /// Declared in the order in which they depend on those before.
@@ -104,10 +84,14 @@ class Server::Parts {
         compute({.threads = ComputeThreads(options.compute_threads),
                  .max_queued = Queued(),
                  .gives_way = true}),
-        access(*store, [] { return absl::Now(); }, options.require_tokens),
-        context{access, *store, models, io, compute, training, jobs, options, absl::Now()},
-        sessions(*store, models),
+        access(*store, [] { return absl::Now(); }, options.security),
+        context{access, *store, models, io, compute, training, jobs, options, absl::Now(), metrics, live_calls},
+        sessions(*store, models, metrics),
         estimation(context, sessions) {
+    metrics->AddGauges([this] {
+      return ServerGauges({*store, models, sessions, io, compute});
+    });
+    metrics->AddGauges(ProcessMetrics);
     services.push_back(MakeModelService(context));
     services.push_back(MakeTrainingService(context));
     services.push_back(MakeAdaptationService(context));
@@ -117,13 +101,22 @@ class Server::Parts {
     services.push_back(MakeAdminService(context));
   }
 
+  absl::Status ListenForMetrics() {
+    if (options.metrics_listen.empty()) return absl::OkStatus();
+    METAEKF_ASSIGN_OR_RETURN(metrics_port, MetricsPort::Open(options.metrics_listen, metrics));
+    return absl::OkStatus();
+  }
+
   absl::Status Listen(const Address& address) {
     grpc::EnableDefaultHealthCheckService(true);
     grpc::reflection::InitProtoReflectionServerBuilderPlugin();
     grpc::ServerBuilder builder;
     SetLimits(options.limits, builder);
+    // A connection keeps the certificates that it began with. Its streams may take as long as they like.
+    builder.AddChannelArgument(GRPC_ARG_MAX_CONNECTION_AGE_MS,
+                               static_cast<int>(absl::ToInt64Milliseconds(options.security.max_connection_age)));
     host = address.host;
-    builder.AddListeningPort(options.listen, grpc::InsecureServerCredentials(), &port);
+    builder.AddListeningPort(options.listen, credentials, &port);
     for (const auto& service : services) builder.RegisterService(service.get());
     builder.RegisterService(&estimation);
     grpc_server = builder.BuildAndStart();
@@ -132,20 +125,28 @@ class Server::Parts {
           absl::StrCat("cannot listen on ", options.listen,
                        ": the port is in use or not allowed; choose another with --listen"));
     }
+    for (const char* service : {"ModelService", "TrainingService", "AdaptationService", "PredictionService",
+                                "SmoothingService", "EstimationService", "ServerService", "AdminService"}) {
+      grpc_server->GetHealthCheckService()->SetServingStatus(absl::StrCat("metaekf.v1.", service), true);
+    }
     keep_warm.emplace(grpc_server->InProcessChannel(grpc::ChannelArguments()));
     return absl::OkStatus();
   }
 
   void Drain(absl::Duration timeout) {
     if (grpc_server == nullptr) return;
-    const auto deadline = absl::ToChronoTime(absl::Now() + timeout);
+    const absl::Time deadline = absl::Now() + timeout;
     grpc_server->GetHealthCheckService()->SetServingStatus(false);
     keep_warm.reset();
     jobs.Close();
     std::thread checkpoints([this] { training.Stop(); });
+    std::thread last_scrape([this] { metrics_port.reset(); });  // takes two seconds
     estimation.Drain(std::chrono::steady_clock::now() + absl::ToChronoMilliseconds(timeout / 2));
-    grpc_server->Shutdown(deadline);
+    live_calls.WaitForNone(deadline);
+    // What a client says after its last call is waited for, a moment: one that is idle may never say it.
+    grpc_server->Shutdown(absl::ToChronoTime(std::min(deadline, absl::Now() + kFarewell)));
     checkpoints.join();
+    last_scrape.join();
     grpc_server.reset();
   }
 
@@ -153,28 +154,35 @@ class Server::Parts {
 
   const ServerOptions options;
   const std::unique_ptr<store::Store> store;
+  const std::shared_ptr<Metrics> metrics = std::make_shared<Metrics>();
   ModelCache models;
   JobFeed jobs;
   TrainingScheduler training;
   BackgroundExecutor io;
   BackgroundExecutor compute;
   AccessControl access;
+  LiveCalls live_calls;
   const ServiceContext context;
   SessionManager sessions;
   EstimationService estimation;
   std::vector<std::unique_ptr<grpc::Service>> services;
+  std::shared_ptr<grpc::ServerCredentials> credentials;  // which are asked at each handshake
   std::unique_ptr<grpc::Server> grpc_server;
   std::optional<KeepWarm> keep_warm;
+  std::unique_ptr<MetricsPort> metrics_port;
   std::string host;
   int port = 0;
 };
 
 absl::StatusOr<std::unique_ptr<Server>> Server::Start(const ServerOptions& options) {
-  METAEKF_ASSIGN_OR_RETURN(const Address address, CheckAddress(options));
+  METAEKF_ASSIGN_OR_RETURN(const Address address, CheckExposure(options));
+  METAEKF_ASSIGN_OR_RETURN(auto credentials, MakeCredentials(options.security));
   METAEKF_ASSIGN_OR_RETURN(auto store,
-                           store::Store::Open(options.data_directory, [] { return absl::Now(); }));
+                           store::Store::Open(options.data_directory, [] { return absl::Now(); }, options.quotas));
   auto parts = std::make_unique<Parts>(options, std::move(store));
+  parts->credentials = std::move(credentials);
   METAEKF_RETURN_IF_ERROR(parts->access.Reload());
+  METAEKF_RETURN_IF_ERROR(parts->ListenForMetrics());
   METAEKF_RETURN_IF_ERROR(parts->Listen(address));
   METAEKF_RETURN_IF_ERROR(parts->training.Start());
   return std::unique_ptr<Server>(new Server(std::move(parts)));
@@ -187,6 +195,10 @@ Server::~Server() { Drain(parts_->options.drain_timeout); }
 int Server::port() const { return parts_->port; }
 
 std::string Server::address() const { return absl::StrCat(parts_->host, ":", parts_->port); }
+
+int Server::metrics_port() const {
+  return parts_->metrics_port == nullptr ? 0 : parts_->metrics_port->port();
+}
 
 void Server::Drain(absl::Duration timeout) { parts_->Drain(timeout); }
 

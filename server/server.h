@@ -22,6 +22,8 @@ class Server {
   int port() const;
   /// HOST:PORT that it listens on.
   std::string address() const;
+  /// Of options.metrics_listen; 0 if there is none.
+  int metrics_port() const;
 
   /// Stops: health says NOT_SERVING, streams end with UNAVAILABLE, training workers write a
   /// checkpoint and their jobs are given back, calls may finish until the timeout and are cancelled

@@ -54,13 +54,23 @@ int Run(const std::vector<std::string>& arguments, Console& console) {
   app.add_option("--server", console.server, "HOST:PORT of the server")
       ->envname("METAEKF_SERVER")
       ->capture_default_str();
+  app.add_option("--token-file", console.access.token_file,
+                 "File with the token to show to the server; else METAEKF_TOKEN holds it");
+  app.add_flag("--tls", console.access.tls, "Encrypt; trust the authorities that this machine trusts")
+      ->envname("METAEKF_TLS");
+  app.add_option("--tls-ca", console.access.tls_ca, "Encrypt; trust those in this PEM file instead")
+      ->envname("METAEKF_TLS_CA");
+  app.add_option("--tls-cert", console.access.tls_cert, "Show this certificate (PEM), for mutual TLS")
+      ->envname("METAEKF_TLS_CERT");
+  app.add_option("--tls-key", console.access.tls_key, "The key of --tls-cert (PEM)")
+      ->envname("METAEKF_TLS_KEY");
   std::string format = "table";
   auto* format_option = app.add_option("--output", format, "How results are printed")
                             ->check(CLI::IsMember({"table", "json", "csv"}))
                             ->capture_default_str();
   Command chosen;
-  for (auto* add : {AddDoctor, AddSimulate, AddTrain, AddJobs, AddModels, AddAdapt, AddAdaptations,
-                    AddPredict, AddEstimate, AddCompare, AddReproduce}) {
+  for (auto* add : {AddDoctor, AddStatus, AddSimulate, AddTrain, AddJobs, AddModels, AddAdapt, AddAdaptations,
+                    AddPredict, AddEstimate, AddCompare, AddReproduce, AddAdmin}) {
     add(app, console, chosen);
   }
   try {
@@ -74,7 +84,8 @@ int Run(const std::vector<std::string>& arguments, Console& console) {
   console.format = format == "json"  ? Format::kJson
                    : format == "csv" ? Format::kCsv
                                      : Format::kTable;
-  const absl::Status status = chosen();
+  absl::Status status = console.TakeAccess();
+  if (status.ok()) status = chosen();
   console.out.flush();
   if (IsUsageError(status)) return ReportUsage(app, std::string(status.message()), console);
   if (!status.ok()) console.err << "metaekf: " << status.message() << std::endl;

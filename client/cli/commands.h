@@ -25,6 +25,10 @@ void AddPredict(CLI::App& app, Console& console, Command& chosen);
 void AddEstimate(CLI::App& app, Console& console, Command& chosen);
 void AddCompare(CLI::App& app, Console& console, Command& chosen);
 void AddReproduce(CLI::App& app, Console& console, Command& chosen);
+void AddStatus(CLI::App& app, Console& console, Command& chosen);
+void AddAdmin(CLI::App& app, Console& console, Command& chosen);
+/// Of "metaekf admin".
+void AddBackups(CLI::App& admin, Console& console, Command& chosen);
 
 /// Lets `command` be what is chosen with `subcommand`.
 inline void OnChosen(CLI::App* subcommand, Command& chosen, Command command) {

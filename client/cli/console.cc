@@ -1,11 +1,13 @@
 #include "client/cli/console.h"
 
 #include <cerrno>
+#include <cstdlib>
 #include <cstring>
 #include <filesystem>
 #include <fstream>
 #include <iterator>
 
+#include "absl/strings/ascii.h"
 #include "core/base/status.h"
 
 namespace metaekf::cli {
@@ -27,10 +29,49 @@ std::string Hint(const client::Status& status) {
   return "";
 }
 
+/// Whether HOST:PORT is of this machine whatever a name server says.
+bool IsThisMachine(const std::string& server) {
+  const std::string host = server.substr(0, server.rfind(':'));
+  return host == "localhost" || host == "[::1]" ||
+         (host.rfind("127.", 0) == 0 && host.find_first_not_of("0123456789.") == std::string::npos);
+}
+
 }  // namespace
 
+absl::Status Console::TakeAccess() {
+  if (!access.token_file.empty()) {
+    METAEKF_ASSIGN_OR_RETURN(const std::string text, ReadFile(access.token_file));
+    options_.token = std::string(absl::StripAsciiWhitespace(text));
+    if (options_.token.empty()) return UsageError(absl::StrCat(access.token_file, " holds no token"));
+  } else if (const char* given = std::getenv("METAEKF_TOKEN"); given != nullptr) {
+    options_.token = given;
+  }
+  if (access.tls_cert.empty() != access.tls_key.empty()) {
+    return UsageError("--tls-cert and --tls-key go together: give both or neither");
+  }
+  if (access.tls || !access.tls_ca.empty() || !access.tls_cert.empty()) {
+    options_.tls.emplace();
+    const std::pair<const std::string&, std::string&> files[] = {
+        {access.tls_ca, options_.tls->authorities},
+        {access.tls_cert, options_.tls->certificate},
+        {access.tls_key, options_.tls->key}};
+    for (const auto& [path, text] : files) {
+      if (path.empty()) continue;
+      METAEKF_ASSIGN_OR_RETURN(text, ReadFile(path));
+    }
+  }
+  if (!options_.token.empty() && !options_.tls && !IsThisMachine(server)) {
+    return UsageError(absl::StrCat("the token would go to ", server,
+                                   " unencrypted, for others to read: give --tls, or --tls-ca FILE"));
+  }
+  return absl::OkStatus();
+}
+
 client::Client& Console::client() {
-  if (!client_) client_ = std::make_unique<client::Client>(client::Options{.server = server});
+  if (!client_) {
+    options_.server = server;
+    client_ = std::make_unique<client::Client>(options_);
+  }
   return *client_;
 }
 

@@ -20,6 +20,10 @@ class Console {
   Console(std::istream& input, std::ostream& output, std::ostream& errors, bool errors_to_terminal)
       : in(input), out(output), err(errors), err_is_terminal(errors_to_terminal) {}
 
+  /// Reads what `access` names, and METAEKF_TOKEN. Errors: those of ReadFile; UsageError for an empty file of a token,
+  /// half a certificate, or a token that would be sent through a network unencrypted.
+  absl::Status TakeAccess();
+
   /// The connection, made when it is first needed.
   client::Client& client();
 
@@ -28,10 +32,16 @@ class Console {
   std::ostream& err;  ///< everything else
   bool err_is_terminal;
   std::string server = "127.0.0.1:50051";
+  struct Access {
+    std::string token_file;
+    bool tls = false;
+    std::string tls_ca, tls_cert, tls_key;
+  } access;  ///< files; empty: none
   Format format = Format::kTable;
   bool format_given = false;
 
  private:
+  client::Options options_;
   std::unique_ptr<client::Client> client_;
 };
 

@@ -31,12 +31,16 @@ void CheckServer(const client::ServerInfo& info, Checks& checks) {
   checks.Add("version", info.version == METAEKF_VERSION,
              absl::StrCat("server ", info.version, ", command line ", METAEKF_VERSION),
              "install the same version on both sides");
-  const double free_bytes = static_cast<double>(info.free_disk_bytes);
-  checks.Add("disk", free_bytes >= kLowDiskBytes,
-             absl::StrCat(base::FormatShort(1e-9 * free_bytes), " GB free, ",
-                          base::FormatShort(1e-6 * static_cast<double>(info.stored_bytes)),
-                          " MB of models and data stored"),
-             "make room on the disk of the server's data directory");
+  const std::string stored =
+      absl::StrCat(base::FormatShort(1e-6 * static_cast<double>(info.stored_bytes)), " MB of models and data stored");
+  if (info.free_disk_bytes) {
+    const double free_bytes = static_cast<double>(*info.free_disk_bytes);
+    checks.Add("disk", free_bytes >= kLowDiskBytes,
+               absl::StrCat(base::FormatShort(1e-9 * free_bytes), " GB free, ", stored),
+               "make room on the disk of the server's data directory");
+  } else {
+    checks.Add("disk", true, stored, "");
+  }
   checks.Add("data directory", info.problems.empty(),
              absl::StrCat("format ", info.data_format_version, ", ", info.problems.size(),
                           " damaged or missing files"),

@@ -30,6 +30,7 @@ struct Flags {
   bool smooth = false;
   std::string projection = "qp";
   int32_t initial_samples = 0;
+  double reconnect_for_s = client::EstimationOptions().reconnect_for_s;
 };
 
 /// What is kept of the estimates for the plot.
@@ -220,7 +221,8 @@ absl::Status Estimate(const Flags& flags, Console& console) {
                                     .gate = Gate(flags),
                                     .projection = ProjectionOf(flags),
                                     .stay_diverged = flags.stay_diverged,
-                                    .max_in_flight = kMaxInFlight};
+                                    .max_in_flight = kMaxInFlight,
+                                    .reconnect_for_s = flags.reconnect_for_s};
   METAEKF_ASSIGN_OR_RETURN(options.noise, ReadNoise(flags));
   METAEKF_ASSIGN_OR_RETURN(SampleSender sender, OpenData(flags, model, console));
   METAEKF_ASSIGN_OR_RETURN(std::unique_ptr<client::EstimationSession> opened,
@@ -288,6 +290,10 @@ void AddEstimate(CLI::App& app, Console& console, Command& chosen) {
   command->add_option("--max-lag-s", flags->max_lag_s,
                       "How late a measurement may be: rows with an earlier t than the latest are applied at their own time")
       ->check(CLI::NonNegativeNumber);
+  command->add_option("--reconnect-for-s", flags->reconnect_for_s,
+                      "How long to try to go on where the connection or the server is lost; 0: not at all")
+      ->check(CLI::NonNegativeNumber)
+      ->capture_default_str();
   flags->columns.AddTo(command);
   OnChosen(command, chosen, [flags, &console] { return Estimate(*flags, console); });
 }

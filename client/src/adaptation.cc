@@ -19,6 +19,7 @@ Result<Adaptation> Client::Adapt(const AdaptationRequest& request,
   using Stream = grpc::ClientReaderWriter<v1::AdaptRequest, v1::AdaptResponse>;
   impl_->Connect();
   grpc::ClientContext context;
+  impl_->Authorise(context);
   const std::unique_ptr<Stream> stream = impl_->adaptations->Adapt(&context);
   const auto write = [&](Stream& out) {
     if (!out.Write(first)) return Status();

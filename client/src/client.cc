@@ -24,22 +24,29 @@ grpc::ChannelArguments Arguments() {
   return arguments;
 }
 
+std::shared_ptr<grpc::ChannelCredentials> Credentials(const std::optional<Tls>& tls) {
+  if (!tls) return grpc::InsecureChannelCredentials();
+  return grpc::SslCredentials({tls->authorities, tls->key, tls->certificate});
+}
+
 }  // namespace
 
 Client::Impl::Impl(const Options& client_options)
     : options(client_options),
-      channel(grpc::CreateCustomChannel(options.server, grpc::InsecureChannelCredentials(),
-                                        Arguments())),
+      channel(grpc::CreateCustomChannel(options.server, Credentials(options.tls), Arguments())),
       server(v1::ServerService::NewStub(channel)),
       models(v1::ModelService::NewStub(channel)),
       training(v1::TrainingService::NewStub(channel)),
       adaptations(v1::AdaptationService::NewStub(channel)),
       predictions(v1::PredictionService::NewStub(channel)),
       estimation(v1::EstimationService::NewStub(channel)),
-      smoothing(v1::SmoothingService::NewStub(channel)) {}
+      smoothing(v1::SmoothingService::NewStub(channel)),
+      admin(v1::AdminService::NewStub(channel)) {}
 
 Status Client::Impl::Translate(const grpc::Status& status) const {
   Status result = FromGrpc(status);
+  // gRPC cancels calls that reach a server while it ends.
+  if (result.code == Code::kCancelled && status.error_details().empty()) result.code = Code::kUnavailable;
   if (result.code == Code::kUnavailable && status.error_details().empty()) {
     // Errors of gRPC itself, not of the server.
     const bool unresolved = result.message.find("resolution failed") != std::string::npos;
@@ -81,6 +88,7 @@ void Client::Impl::Connect() const {
   if (state != GRPC_CHANNEL_TRANSIENT_FAILURE) return;
   grpc::ClientContext context;
   SetDeadline(context);
+  Authorise(context);
   v1::ServerInfo info;
   const Status why = Translate(server->GetServerInfo(&context, v1::GetServerInfoRequest(), &info));
   if (why.reason == "NO_CONNECTION") channel->WaitForStateChange(state, system_clock::now() + kSecondChance);
@@ -89,6 +97,10 @@ void Client::Impl::Connect() const {
 void Client::Impl::SetDeadline(grpc::ClientContext& context) const {
   context.set_deadline(std::chrono::system_clock::now() +
                        std::chrono::microseconds(std::llround(1e6 * options.timeout_s)));
+}
+
+void Client::Impl::Authorise(grpc::ClientContext& context) const {
+  if (!options.token.empty()) context.AddMetadata("authorization", "Bearer " + options.token);
 }
 
 Client::Client(const Options& options) : impl_(std::make_shared<Impl>(options)) {}

@@ -55,7 +55,7 @@ ServerInfo FromProto(const v1::ServerInfo& message) {
           .start_time = ToTime(message.start_time()),
           .data_format_version = data.format_version(),
           .stored_bytes = data.stored_bytes(),
-          .free_disk_bytes = data.free_disk_bytes(),
+          .free_disk_bytes = data.has_free_disk_bytes() ? std::optional(data.free_disk_bytes()) : std::nullopt,
           .problems = {data.problems().begin(), data.problems().end()},
           .models = data.model_count(),
           .model_versions = data.model_version_count(),
@@ -64,6 +64,44 @@ ServerInfo FromProto(const v1::ServerInfo& message) {
           .queued_jobs = data.queued_job_count(),
           .running_jobs = data.running_job_count(),
           .ended_jobs = data.ended_job_count()};
+}
+
+Token FromProto(const v1::Token& message) {
+  Token token;
+  token.id = Segment(message.name(), 1);
+  token.tenant = message.tenant();
+  token.scope = static_cast<Scope>(std::max(0, static_cast<int>(message.scope()) - 1));
+  token.note = message.note();
+  token.create_time = ToTime(message.create_time());
+  if (message.has_expire_time()) token.expire_time = ToTime(message.expire_time());
+  if (message.has_revoke_time()) token.revoke_time = ToTime(message.revoke_time());
+  return token;
+}
+
+MetricFamily FromProto(const v1::MetricFamily& message) {
+  MetricFamily family{.name = message.name(), .help = message.help(), .metrics = {}};
+  for (const v1::Metric& given : message.metrics()) {
+    Metric& metric = family.metrics.emplace_back();
+    metric.labels.insert(given.labels().begin(), given.labels().end());
+    metric.value = given.value();
+    if (!given.has_histogram()) continue;
+    const auto& histogram = given.histogram();
+    metric.histogram = {histogram.count(),
+                        histogram.sum(),
+                        {histogram.upper_bounds().begin(), histogram.upper_bounds().end()},
+                        {histogram.cumulative_counts().begin(), histogram.cumulative_counts().end()}};
+  }
+  return family;
+}
+
+BackupInfo FromProto(const v1::CreateBackupResponse::Header& message) {
+  return {message.server_version(), message.data_format_version(), ToTime(message.create_time()), message.file_count(),
+          message.size_bytes()};
+}
+
+AuditEntry FromProto(const v1::AuditEntry& message) {
+  return {message.number(),   ToTime(message.time()), message.tenant(), message.identity(),
+          message.action(),   message.resource(),     message.detail()};
 }
 
 Model FromProto(const v1::Model& message) {

@@ -5,6 +5,7 @@
 
 #include "metaekf/client.h"
 #include "metaekf/v1/adaptation.pb.h"
+#include "metaekf/v1/admin.pb.h"
 #include "metaekf/v1/data.pb.h"
 #include "metaekf/v1/estimation.pb.h"
 #include "metaekf/v1/model.pb.h"
@@ -15,6 +16,10 @@
 namespace metaekf::client {
 
 ServerInfo FromProto(const v1::ServerInfo& message);
+Token FromProto(const v1::Token& message);
+MetricFamily FromProto(const v1::MetricFamily& message);
+BackupInfo FromProto(const v1::CreateBackupResponse::Header& message);
+AuditEntry FromProto(const v1::AuditEntry& message);
 Model FromProto(const v1::Model& message);
 ModelVersion FromProto(const v1::ModelVersion& message);
 TrainingProgress FromProto(const v1::TrainingProgress& message);

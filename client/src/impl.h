@@ -15,6 +15,7 @@
 #include "client/src/status.h"
 #include "metaekf/client.h"
 #include "metaekf/v1/adaptation.grpc.pb.h"
+#include "metaekf/v1/admin.grpc.pb.h"
 #include "metaekf/v1/estimation.grpc.pb.h"
 #include "metaekf/v1/model.grpc.pb.h"
 #include "metaekf/v1/prediction.grpc.pb.h"
@@ -39,7 +40,7 @@ namespace metaekf::client {
 struct Client::Impl {
   explicit Impl(const Options& client_options);
 
-  /// `status` in the library's terms; errors of the connection say what to look at.
+  /// `status`, of a call that was not cancelled here, in the library's terms; errors of the connection say what to look at.
   Status Translate(const grpc::Status& status) const;
 
   /// One request, one response, within the time limit.
@@ -50,6 +51,7 @@ struct Client::Impl {
     Connect();
     grpc::ClientContext context;
     SetDeadline(context);
+    Authorise(context);
     return Translate((service.get()->*method)(&context, request, response));
   }
 
@@ -87,15 +89,20 @@ struct Client::Impl {
       }
     });
     Response response;
+    bool stopped = false;
     while (stream.Read(&response)) {
-      if (!on_response(response)) context.TryCancel();
+      stopped = stopped || !on_response(response);
+      if (stopped) context.TryCancel();
     }
     writer.join();
     const grpc::Status status = stream.Finish();
-    return written.ok() ? Translate(status) : written;
+    if (!written.ok()) return written;
+    return stopped ? FromGrpc(status) : Translate(status);
   }
 
   void SetDeadline(grpc::ClientContext& context) const;
+  /// Shows who calls. For every call; Call does it.
+  void Authorise(grpc::ClientContext& context) const;
 
   /// Gives the channel a second chance to connect where the first failed for no good reason; whatever comes of it, the next
   /// call says. To be called before every call: gRPC 1.51 takes some connections in the making for failed, for it looks at
@@ -111,6 +118,7 @@ struct Client::Impl {
   std::unique_ptr<v1::PredictionService::Stub> predictions;
   std::unique_ptr<v1::EstimationService::Stub> estimation;
   std::unique_ptr<v1::SmoothingService::Stub> smoothing;
+  std::unique_ptr<v1::AdminService::Stub> admin;
 };
 
 }  // namespace metaekf::client

@@ -59,6 +59,7 @@ Result<std::string> Client::ExportModel(const std::string& model) {
   METAEKF_CLIENT_ASSIGN_OR_RETURN(*request.mutable_name(), ModelResource(model));
   impl_->Connect();
   grpc::ClientContext context;
+  impl_->Authorise(context);
   const auto stream = impl_->models->ExportModelVersion(&context, request);
   v1::ModelVersion header;
   v1::ExportModelVersionResponse response;
@@ -84,6 +85,7 @@ Result<ModelVersion> Client::ImportModel(const std::string& model, const std::st
 
   impl_->Connect();
   grpc::ClientContext context;
+  impl_->Authorise(context);
   v1::ModelVersion response;
   const auto stream = impl_->models->ImportModelVersion(&context, &response);
   bool open = stream->Write(request);

@@ -14,6 +14,7 @@ Result<std::vector<Prediction>> Client::Predict(
   using Stream = grpc::ClientReaderWriter<v1::PredictRequest, v1::PredictResponse>;
   impl_->Connect();
   grpc::ClientContext context;
+  impl_->Authorise(context);
   const std::unique_ptr<Stream> stream = impl_->predictions->Predict(&context);
   const auto write = [&](Stream& out) {
     bool open = out.Write(first);

@@ -15,6 +15,7 @@ Result<Smoothed> Client::Smooth(const SmoothingRequest& request) {
   using Stream = grpc::ClientReaderWriter<v1::SmoothRequest, v1::SmoothResponse>;
   impl_->Connect();
   grpc::ClientContext context;
+  impl_->Authorise(context);
   const std::unique_ptr<Stream> stream = impl_->smoothing->Smooth(&context);
   const auto write = [&](Stream& out) {
     if (!out.Write(first)) return Status();

@@ -26,6 +26,7 @@ Result<Job> Client::CreateTrainingJob(const TrainingRequest& request) {
 
   impl_->Connect();
   grpc::ClientContext context;
+  impl_->Authorise(context);
   v1::Job response;
   const auto stream = impl_->training->CreateTrainingJob(&context, &response);
   bool open = stream->Write(message);
@@ -65,6 +66,7 @@ Result<Job> Client::WatchJob(const std::string& id,
   request.set_name("jobs/" + job.id);
   impl_->Connect();
   grpc::ClientContext context;
+  impl_->Authorise(context);
   const auto stream = impl_->training->WatchJob(&context, request);
   v1::WatchJobResponse response;
   bool wanted = true;

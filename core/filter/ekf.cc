@@ -474,7 +474,9 @@ void Ekf::PutInside(FilterModel::Scratch* scratch, Estimate* estimate) {
 }
 
 void Ekf::JudgeHealth(Estimate* estimate) {
-  if (!state_.mean.allFinite() || !state_.factor.allFinite()) state_.diverged = true;
+  // Outputs may overflow where the latent state does not yet.
+  const bool told = warming_up() || (estimate->mean.allFinite() && estimate->cov.allFinite());
+  if (!state_.mean.allFinite() || !state_.factor.allFinite() || !told) state_.diverged = true;
   estimate->health = warming_up() ? Health::kWarmingUp : state_.diverged ? Health::kDiverged : state_.nis.Judge();
 }
 

@@ -10,6 +10,7 @@
 #include "core/base/status.h"
 #include "metaekf/v1/config.pb.h"
 #include "server/store/files.h"
+#include "server/store/names.h"
 
 namespace metaekf::server {
 namespace {
@@ -51,13 +52,78 @@ class Taker {
 
   const absl::Status& status() const { return status_; }
 
- private:
   void Fail(const std::string& name, const std::string& what) {
     if (status_.ok()) status_ = absl::InvalidArgumentError(absl::StrCat(name, " ", what));
   }
 
+ private:
   absl::Status status_;
 };
+
+absl::StatusOr<store::Scope> ToScope(v1::Scope scope) {
+  switch (scope) {
+    case v1::READ:
+      return store::Scope::kRead;
+    case v1::STREAM:
+      return store::Scope::kStream;
+    case v1::WRITE:
+      return store::Scope::kWrite;
+    case v1::ADMIN:
+      return store::Scope::kAdmin;
+    default:
+      return absl::InvalidArgumentError("scope must be READ, STREAM, WRITE or ADMIN");
+  }
+}
+
+absl::StatusOr<ServerOptions::Security::Client> ToClient(const v1::ServerConfig::Security::Client& given) {
+  if (given.certificate_name().empty()) return absl::InvalidArgumentError("certificate_name is missing");
+  METAEKF_RETURN_IF_ERROR(store::CheckName("tenant", given.tenant()));
+  METAEKF_ASSIGN_OR_RETURN(const store::Scope scope, ToScope(given.scope()));
+  return ServerOptions::Security::Client{given.certificate_name(), given.tenant(), scope};
+}
+
+void ApplySecurity(const v1::ServerConfig::Security& given, Taker& taker,
+                   ServerOptions::Security* security) {
+  if (given.has_certificate_file()) security->certificate_file = given.certificate_file();
+  if (given.has_key_file()) security->key_file = given.key_file();
+  if (given.has_client_ca_file()) security->client_ca_file = given.client_ca_file();
+  if (given.has_require_tokens()) security->require_tokens = given.require_tokens();
+  for (int c = 0; c < given.clients_size(); ++c) {
+    const auto client = ToClient(given.clients(c));
+    if (!client.ok()) {
+      taker.Fail(absl::StrCat("security.clients[", c, "]:"), std::string(client.status().message()));
+    } else {
+      security->clients.push_back(*client);
+    }
+  }
+  for (const std::string& proxy : given.proxies()) security->proxies.push_back(proxy);
+  taker.Seconds("security.max_connection_age_s", given.has_max_connection_age_s(),
+                given.max_connection_age_s(), &security->max_connection_age);
+}
+
+void ApplyQuotas(const v1::ServerConfig& config, Taker& taker, store::Quotas* quotas) {
+  for (int q = 0; q < config.quotas_size(); ++q) {
+    const v1::ServerConfig::Quota& given = config.quotas(q);
+    const std::string name = absl::StrCat("quotas[", q, "]");
+    if (given.has_tenant()) {
+      const absl::Status named = store::CheckName("tenant", given.tenant());
+      if (!named.ok()) taker.Fail(name + ":", std::string(named.message()));
+    }
+    store::Quota& quota = given.has_tenant() ? quotas->by_tenant[given.tenant()] : quotas->others;
+    taker.Count(name + ".sessions", given.has_sessions(), given.sessions(), 0, &quota.sessions);
+    taker.Count(name + ".adaptations", given.has_adaptations(), given.adaptations(), 0, &quota.adaptations);
+    taker.Count(name + ".stored_bytes", given.has_stored_bytes(), given.stored_bytes(), 0, &quota.stored_bytes);
+    taker.Count(name + ".queued_jobs", given.has_queued_jobs(), given.queued_jobs(), 0, &quota.queued_jobs);
+    taker.Count(name + ".running_jobs", given.has_running_jobs(), given.running_jobs(), 0, &quota.running_jobs);
+    if (!given.has_samples_per_s()) continue;
+    if (given.samples_per_s() > 0) {
+      quota.samples_per_s = given.samples_per_s();
+    } else {
+      taker.Fail(name + ".samples_per_s",
+                 absl::StrCat("is ", base::FormatExact(given.samples_per_s()), ", must be positive"));
+    }
+  }
+}
 
 }  // namespace
 
@@ -70,6 +136,7 @@ absl::Status ApplyConfig(const std::string& text, ServerOptions* options) {
 
   if (config.has_data_directory()) options->data_directory = config.data_directory();
   if (config.has_listen()) options->listen = config.listen();
+  if (config.has_metrics_listen()) options->metrics_listen = config.metrics_listen();
   Taker taker;
   taker.Count("model_cache_bytes", config.has_model_cache_bytes(), config.model_cache_bytes(), 0,
               &options->model_cache_bytes);
@@ -78,6 +145,9 @@ absl::Status ApplyConfig(const std::string& text, ServerOptions* options) {
               &options->compute_threads);
   taker.Seconds("drain_timeout_s", config.has_drain_timeout_s(), config.drain_timeout_s(),
                 &options->drain_timeout);
+
+  ApplySecurity(config.security(), taker, &options->security);
+  ApplyQuotas(config, taker, &options->quotas);
 
   const v1::ServerConfig::Training& training = config.training();
   ServerOptions::Training& jobs = options->training;

@@ -12,6 +12,7 @@
 #include "server/convert/adaptations.h"
 #include "server/convert/samples.h"
 #include "server/handlers/adaptation_handlers.h"
+#include "server/metrics/metrics.h"
 #include "server/names/resource_names.h"
 #include "server/status/details.h"
 #include "server/store/sha256.h"
@@ -65,7 +66,9 @@ class AdaptCall final : public StreamHandler<Request, Response> {
                                            if (!step.trial) SendProgress(step, sink);
                                            return !sink.cancelled();
                                          }));
-    return Store(std::move(result), id, absl::ToDoubleSeconds(absl::Now() - start), sink);
+    const absl::Duration duration = absl::Now() - start;
+    context_.server.metrics->CountAdaptation(duration, result.context_loss_before, result.context_loss_after);
+    return Store(std::move(result), id, absl::ToDoubleSeconds(duration), sink);
   }
 
  private:

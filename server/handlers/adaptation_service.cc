@@ -19,24 +19,24 @@ class AdaptationService final : public v1::AdaptationService::CallbackService {
   grpc::ServerBidiReactor<v1::AdaptRequest, v1::AdaptResponse>* Adapt(
       CallbackServerContext* call) override {
     using Reactor = grpc::ServerBidiReactor<v1::AdaptRequest, v1::AdaptResponse>;
-    return Admitted<Reactor>(call, context_, Scope::kWrite, [&](CallContext context) {
-      return new BidiCall(call, server::Adapt(std::move(context)), context_.io, context_.compute);
+    return Admitted<Reactor>(call, context_, {"Adapt", Scope::kWrite}, [&](CallContext context, const auto& record) {
+      return new BidiCall(call, record, server::Adapt(std::move(context)), context_.io, context_.compute);
     });
   }
   ServerUnaryReactor* GetAdaptation(CallbackServerContext* call,
                                     const v1::GetAdaptationRequest* request,
                                     v1::Adaptation* response) override {
-    return RunUnary(call, context_, Scope::kRead, server::GetAdaptation, request, response);
+    return RunUnary(call, context_, {"GetAdaptation", Scope::kRead}, server::GetAdaptation, request, response);
   }
   ServerUnaryReactor* ListAdaptations(CallbackServerContext* call,
                                       const v1::ListAdaptationsRequest* request,
                                       v1::ListAdaptationsResponse* response) override {
-    return RunUnary(call, context_, Scope::kRead, server::ListAdaptations, request, response);
+    return RunUnary(call, context_, {"ListAdaptations", Scope::kRead}, server::ListAdaptations, request, response);
   }
   ServerUnaryReactor* DeleteAdaptation(CallbackServerContext* call,
                                        const v1::DeleteAdaptationRequest* request,
                                        google::protobuf::Empty* response) override {
-    return RunUnary(call, context_, Scope::kWrite, server::DeleteAdaptation, request, response);
+    return RunUnary(call, context_, {"DeleteAdaptation", Scope::kWrite}, server::DeleteAdaptation, request, response);
   }
 
  private:

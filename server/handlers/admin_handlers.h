@@ -1,7 +1,10 @@
 #pragma once
 
+#include <memory>
+
 #include "metaekf/v1/admin.pb.h"
 #include "server/handlers/call_context.h"
+#include "server/handlers/stream_handler.h"
 
 /// What the RPCs of AdminService do; admin.proto says what that is.
 namespace metaekf::server {
@@ -14,5 +17,7 @@ absl::Status RevokeToken(CallContext& context, const v1::RevokeTokenRequest& req
                          v1::Token* response);
 absl::Status ListAuditEntries(CallContext& context, const v1::ListAuditEntriesRequest& request,
                               v1::ListAuditEntriesResponse* response);
+
+std::unique_ptr<ResponseSource<v1::CreateBackupResponse>> CreateBackup(CallContext context);
 
 }  // namespace metaekf::server

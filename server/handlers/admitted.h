@@ -3,10 +3,12 @@
 #include <grpcpp/server_context.h>
 #include <grpcpp/support/server_callback.h>
 
+#include <memory>
 #include <utility>
 
+#include "server/access/exposure.h"
 #include "server/handlers/call_context.h"
-#include "server/status/grpc_status.h"
+#include "server/handlers/call_record.h"
 
 namespace metaekf::server {
 
@@ -16,6 +18,11 @@ inline Credentials CredentialsOf(const grpc::CallbackServerContext& call) {
   if (found != call.client_metadata().end()) {
     credentials.authorization = std::string(found->second.data(), found->second.size());
   }
+  // Names of a certificate that the connection's handshake has checked.
+  for (const grpc::string_ref& name : call.auth_context()->GetPeerIdentity()) {
+    credentials.certificate_names.emplace_back(name.data(), name.size());
+  }
+  credentials.peer_host = PeerHost(call.peer());
   return credentials;
 }
 
@@ -23,19 +30,20 @@ inline Credentials CredentialsOf(const grpc::CallbackServerContext& call) {
 template <class Reactor>
 class RefusedCall final : public Reactor {
  public:
-  explicit RefusedCall(const absl::Status& status) { this->Finish(ToGrpcStatus(status)); }
+  explicit RefusedCall(const grpc::Status& status) { this->Finish(status); }
   void OnDone() override { delete this; }
 };
 
-/// The reactor that `make` makes of the call's context, if the caller may do what needs `scope`; else
+/// The reactor that `make` makes of the call's context and its record, if the caller may do what needs rpc.scope; else
 /// one that says why not. Every RPC comes through here.
 template <class Reactor, class Make>
-Reactor* Admitted(const grpc::CallbackServerContext* call, const ServiceContext& server,
-                  store::Scope scope, const Make& make) {
-  absl::StatusOr<Caller> caller = server.access.Admit(CredentialsOf(*call), scope);
-  if (!caller.ok()) return new RefusedCall<Reactor>(caller.status());
+Reactor* Admitted(grpc::CallbackServerContext* call, const ServiceContext& server, const Rpc& rpc, const Make& make) {
+  const auto record = std::make_shared<CallRecord>(rpc, *call, server.metrics, server.live_calls);
+  absl::StatusOr<Caller> caller = server.access.Admit(CredentialsOf(*call), rpc.scope);
+  if (!caller.ok()) return new RefusedCall<Reactor>(record->End(caller.status()));
+  record->SetCaller(*caller);
   store::TenantStore store = server.store.Of(caller->tenant, caller->identity);
-  return make(CallContext{server, *std::move(caller), std::move(store)});
+  return make(CallContext{server, *std::move(caller), std::move(store)}, record);
 }
 
 }  // namespace metaekf::server

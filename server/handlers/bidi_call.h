@@ -11,9 +11,9 @@
 #include <utility>
 
 #include "server/executor/background_executor.h"
+#include "server/handlers/call_record.h"
 #include "server/handlers/overload.h"
 #include "server/handlers/stream_handler.h"
-#include "server/status/grpc_status.h"
 
 namespace metaekf::server {
 
@@ -26,10 +26,10 @@ class BidiCall final : public grpc::ServerBidiReactor<Request, Response>,
                        private ResponseSink<Response> {
  public:
   /// @param at_request, at_end  where the handler's two functions run.
-  BidiCall(grpc::CallbackServerContext* context,
+  BidiCall(grpc::CallbackServerContext* context, std::shared_ptr<CallRecord> record,
            std::unique_ptr<StreamHandler<Request, Response>> handler,
            BackgroundExecutor& at_request, BackgroundExecutor& at_end)
-      : context_(context), handler_(std::move(handler)), at_request_(at_request), at_end_(at_end) {
+      : context_(context), record_(std::move(record)), handler_(std::move(handler)), at_request_(at_request), at_end_(at_end) {
     this->StartRead(&request_);
   }
 
@@ -110,11 +110,12 @@ class BidiCall final : public grpc::ServerBidiReactor<Request, Response>,
       case Action::kWrite:
         return this->StartWrite(message);
       case Action::kFinish:
-        return this->Finish(ToGrpcStatus(*result_));
+        return this->Finish(record_->End(*result_));
     }
   }
 
   grpc::CallbackServerContext* const context_;
+  const std::shared_ptr<CallRecord> record_;
   const std::unique_ptr<StreamHandler<Request, Response>> handler_;
   BackgroundExecutor& at_request_;
   BackgroundExecutor& at_end_;

@@ -2,13 +2,14 @@
 
 #include <grpcpp/support/server_callback.h>
 
+#include <functional>
 #include <memory>
 #include <utility>
 
 #include "server/executor/background_executor.h"
+#include "server/handlers/call_record.h"
 #include "server/handlers/overload.h"
 #include "server/handlers/stream_handler.h"
-#include "server/status/grpc_status.h"
 
 namespace metaekf::server {
 
@@ -17,30 +18,37 @@ namespace metaekf::server {
 template <class Response>
 class DownloadCall final : public grpc::ServerWriteReactor<Response> {
  public:
-  DownloadCall(std::unique_ptr<ResponseSource<Response>> source, BackgroundExecutor& executor)
-      : source_(std::move(source)) {
-    const bool accepted = executor.Submit([this] {
+  DownloadCall(std::shared_ptr<CallRecord> record, std::unique_ptr<ResponseSource<Response>> source,
+               BackgroundExecutor& executor)
+      : record_(std::move(record)), source_(std::move(source)), executor_(executor) {
+    Submit([this] {
       const absl::Status status = source_->Open();
-      if (!status.ok()) return this->Finish(ToGrpcStatus(status));
+      if (!status.ok()) return this->Finish(record_->End(status));
       WriteNext();
     });
-    if (!accepted) this->Finish(ToGrpcStatus(Overloaded()));
   }
 
   void OnWriteDone(bool ok) override {
-    if (ok) return WriteNext();
-    this->Finish(grpc::Status::CANCELLED);
+    if (ok) return Submit([this] { WriteNext(); });
+    this->Finish(record_->End(absl::CancelledError("the call was cancelled")));
   }
   void OnDone() override { delete this; }
 
  private:
-  void WriteNext() {
-    response_.Clear();
-    if (source_->Next(&response_)) return this->StartWrite(&response_);
-    this->Finish(grpc::Status::OK);
+  void Submit(std::function<void()> step) {
+    if (!executor_.Submit(std::move(step))) this->Finish(record_->End(Overloaded()));
   }
 
+  void WriteNext() {
+    response_.Clear();
+    const absl::StatusOr<bool> more = source_->Next(&response_);
+    if (more.ok() && *more) return this->StartWrite(&response_);
+    this->Finish(record_->End(more.status()));
+  }
+
+  const std::shared_ptr<CallRecord> record_;
   const std::unique_ptr<ResponseSource<Response>> source_;
+  BackgroundExecutor& executor_;
   Response response_;
 };
 

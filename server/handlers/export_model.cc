@@ -21,7 +21,7 @@ class Export final : public ResponseSource<Response> {
     return absl::OkStatus();
   }
 
-  bool Next(Response* response) override {
+  absl::StatusOr<bool> Next(Response* response) override {
     if (!header_sent_) {
       *response->mutable_header() = ToMessage(version_);
       header_sent_ = true;

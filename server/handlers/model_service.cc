@@ -19,51 +19,51 @@ class ModelService final : public v1::ModelService::CallbackService {
 
   ServerUnaryReactor* ListModels(CallbackServerContext* call, const v1::ListModelsRequest* request,
                                  v1::ListModelsResponse* response) override {
-    return RunUnary(call, context_, Scope::kRead, server::ListModels, request, response);
+    return RunUnary(call, context_, {"ListModels", Scope::kRead}, server::ListModels, request, response);
   }
   ServerUnaryReactor* GetModel(CallbackServerContext* call, const v1::GetModelRequest* request,
                                v1::Model* response) override {
-    return RunUnary(call, context_, Scope::kRead, server::GetModel, request, response);
+    return RunUnary(call, context_, {"GetModel", Scope::kRead}, server::GetModel, request, response);
   }
   ServerUnaryReactor* ListModelVersions(CallbackServerContext* call,
                                         const v1::ListModelVersionsRequest* request,
                                         v1::ListModelVersionsResponse* response) override {
-    return RunUnary(call, context_, Scope::kRead, server::ListModelVersions, request, response);
+    return RunUnary(call, context_, {"ListModelVersions", Scope::kRead}, server::ListModelVersions, request, response);
   }
   ServerUnaryReactor* GetModelVersion(CallbackServerContext* call,
                                       const v1::GetModelVersionRequest* request,
                                       v1::ModelVersion* response) override {
-    return RunUnary(call, context_, Scope::kRead, server::GetModelVersion, request, response);
+    return RunUnary(call, context_, {"GetModelVersion", Scope::kRead}, server::GetModelVersion, request, response);
   }
   ServerUnaryReactor* SetModelAlias(CallbackServerContext* call,
                                     const v1::SetModelAliasRequest* request,
                                     v1::ModelAlias* response) override {
-    return RunUnary(call, context_, Scope::kWrite, server::SetModelAlias, request, response);
+    return RunUnary(call, context_, {"SetModelAlias", Scope::kWrite}, server::SetModelAlias, request, response);
   }
   ServerUnaryReactor* DeleteModelAlias(CallbackServerContext* call,
                                        const v1::DeleteModelAliasRequest* request,
                                        Empty* response) override {
-    return RunUnary(call, context_, Scope::kWrite, server::DeleteModelAlias, request, response);
+    return RunUnary(call, context_, {"DeleteModelAlias", Scope::kWrite}, server::DeleteModelAlias, request, response);
   }
   ServerUnaryReactor* DeleteModelVersion(CallbackServerContext* call,
                                          const v1::DeleteModelVersionRequest* request,
                                          Empty* response) override {
-    return RunUnary(call, context_, Scope::kWrite, server::DeleteModelVersion, request, response);
+    return RunUnary(call, context_, {"DeleteModelVersion", Scope::kWrite}, server::DeleteModelVersion, request, response);
   }
 
   grpc::ServerReadReactor<v1::ImportModelVersionRequest>* ImportModelVersion(
       CallbackServerContext* call, v1::ModelVersion* response) override {
     using Reactor = grpc::ServerReadReactor<v1::ImportModelVersionRequest>;
-    return Admitted<Reactor>(call, context_, Scope::kWrite, [&](CallContext context) {
-      return new UploadCall(call, server::ImportModelVersion(std::move(context)), context_.io,
+    return Admitted<Reactor>(call, context_, {"ImportModelVersion", Scope::kWrite}, [&](CallContext context, const auto& record) {
+      return new UploadCall(call, record, server::ImportModelVersion(std::move(context)), context_.io,
                             response);
     });
   }
   grpc::ServerWriteReactor<v1::ExportModelVersionResponse>* ExportModelVersion(
       CallbackServerContext* call, const v1::ExportModelVersionRequest* request) override {
     using Reactor = grpc::ServerWriteReactor<v1::ExportModelVersionResponse>;
-    return Admitted<Reactor>(call, context_, Scope::kRead, [&](CallContext context) {
-      return new DownloadCall(server::ExportModelVersion(std::move(context), *request),
+    return Admitted<Reactor>(call, context_, {"ExportModelVersion", Scope::kRead}, [&](CallContext context, const auto& record) {
+      return new DownloadCall(record, server::ExportModelVersion(std::move(context), *request),
                               context_.io);
     });
   }

@@ -16,8 +16,8 @@ class PredictionService final : public v1::PredictionService::CallbackService {
   grpc::ServerBidiReactor<v1::PredictRequest, v1::PredictResponse>* Predict(
       grpc::CallbackServerContext* call) override {
     using Reactor = grpc::ServerBidiReactor<v1::PredictRequest, v1::PredictResponse>;
-    return Admitted<Reactor>(call, context_, Scope::kRead, [&](CallContext context) {
-      return new BidiCall(call, server::Predict(std::move(context)), context_.compute, context_.compute);
+    return Admitted<Reactor>(call, context_, {"Predict", Scope::kRead}, [&](CallContext context, const auto& record) {
+      return new BidiCall(call, record, server::Predict(std::move(context)), context_.compute, context_.compute);
     });
   }
 

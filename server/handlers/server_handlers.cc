@@ -2,6 +2,7 @@
 
 #include "core/base/status.h"
 #include "server/convert/time.h"
+#include "server/metrics/metrics.h"
 
 namespace metaekf::server {
 
@@ -27,6 +28,29 @@ absl::Status GetServerInfo(CallContext& context, const v1::GetServerInfoRequest&
   directory.set_running_job_count(static_cast<uint32_t>(inventory.running_jobs));
   directory.set_ended_job_count(static_cast<uint32_t>(inventory.ended_jobs));
   directory.set_session_count(static_cast<uint32_t>(inventory.sessions));
+  return absl::OkStatus();
+}
+
+absl::Status GetMetrics(CallContext& context, const v1::GetMetricsRequest&, v1::GetMetricsResponse* response) {
+  for (const prometheus::MetricFamily& family : context.server.metrics->Collect()) {
+    v1::MetricFamily& out = *response->add_families();
+    out.set_name(family.name);
+    out.set_help(family.help);
+    for (const prometheus::ClientMetric& metric : family.metric) {
+      v1::Metric& message = *out.add_metrics();
+      for (const auto& label : metric.label) (*message.mutable_labels())[label.name] = label.value;
+      if (family.type == prometheus::MetricType::Histogram) {
+        message.mutable_histogram()->set_count(metric.histogram.sample_count);
+        message.mutable_histogram()->set_sum(metric.histogram.sample_sum);
+        for (const auto& bucket : metric.histogram.bucket) {
+          message.mutable_histogram()->add_upper_bounds(bucket.upper_bound);
+          message.mutable_histogram()->add_cumulative_counts(bucket.cumulative_count);
+        }
+      } else {
+        message.set_value(family.type == prometheus::MetricType::Counter ? metric.counter.value : metric.gauge.value);
+      }
+    }
+  }
   return absl::OkStatus();
 }
 

@@ -6,6 +6,8 @@
 namespace metaekf::server {
 
 /// ServerService.GetServerInfo, as server_info.proto describes it.
+absl::Status GetMetrics(CallContext& context, const v1::GetMetricsRequest& request,
+                        v1::GetMetricsResponse* response);
 absl::Status GetServerInfo(CallContext& context, const v1::GetServerInfoRequest& request,
                            v1::ServerInfo* response);
 

@@ -15,7 +15,11 @@ class ServerService final : public v1::ServerService::CallbackService {
   grpc::ServerUnaryReactor* GetServerInfo(grpc::CallbackServerContext* call,
                                           const v1::GetServerInfoRequest* request,
                                           v1::ServerInfo* response) override {
-    return RunUnary(call, context_, Scope::kRead, server::GetServerInfo, request, response);
+    return RunUnary(call, context_, {"GetServerInfo", Scope::kRead}, server::GetServerInfo, request, response);
+  }
+  grpc::ServerUnaryReactor* GetMetrics(grpc::CallbackServerContext* call, const v1::GetMetricsRequest* request,
+                                       v1::GetMetricsResponse* response) override {
+    return RunUnary(call, context_, {"GetMetrics", Scope::kAdmin}, server::GetMetrics, request, response);
   }
 
  private:

@@ -1,5 +1,7 @@
 #pragma once
 
+#include <memory>
+
 #include "server/access/access_control.h"
 #include "server/executor/background_executor.h"
 #include "server/options.h"
@@ -9,6 +11,9 @@
 #include "server/training/scheduler.h"
 
 namespace metaekf::server {
+
+class LiveCalls;
+class Metrics;
 
 /// What the services work with; all of it outlives them.
 struct ServiceContext {
@@ -21,6 +26,8 @@ struct ServiceContext {
   JobFeed& jobs;
   const ServerOptions& options;
   absl::Time start_time;
+  std::shared_ptr<Metrics> metrics;
+  LiveCalls& live_calls;
 };
 
 }  // namespace metaekf::server

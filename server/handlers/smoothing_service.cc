@@ -16,8 +16,8 @@ class SmoothingService final : public v1::SmoothingService::CallbackService {
   grpc::ServerBidiReactor<v1::SmoothRequest, v1::SmoothResponse>* Smooth(
       grpc::CallbackServerContext* call) override {
     using Reactor = grpc::ServerBidiReactor<v1::SmoothRequest, v1::SmoothResponse>;
-    return Admitted<Reactor>(call, context_, Scope::kRead, [&](CallContext context) {
-      return new BidiCall(call, server::Smooth(std::move(context)), context_.compute, context_.compute);
+    return Admitted<Reactor>(call, context_, {"Smooth", Scope::kRead}, [&](CallContext context, const auto& record) {
+      return new BidiCall(call, record, server::Smooth(std::move(context)), context_.compute, context_.compute);
     });
   }
 

@@ -38,8 +38,8 @@ class ResponseSource {
   virtual ~ResponseSource() = default;
   /// Once, on a background executor.
   virtual absl::Status Open() = 0;
-  /// The next response; false: there are no more. Quick: called in a gRPC reaction.
-  virtual bool Next(Response* response) = 0;
+  /// The next response; false: there are no more. On a background executor, too.
+  virtual absl::StatusOr<bool> Next(Response* response) = 0;
 };
 
 }  // namespace metaekf::server

@@ -20,29 +20,29 @@ class TrainingService final : public v1::TrainingService::CallbackService {
   grpc::ServerReadReactor<v1::CreateTrainingJobRequest>* CreateTrainingJob(
       CallbackServerContext* call, v1::Job* response) override {
     using Reactor = grpc::ServerReadReactor<v1::CreateTrainingJobRequest>;
-    return Admitted<Reactor>(call, context_, Scope::kWrite, [&](CallContext context) {
-      return new UploadCall(call, server::CreateTrainingJob(std::move(context)), context_.io,
+    return Admitted<Reactor>(call, context_, {"CreateTrainingJob", Scope::kWrite}, [&](CallContext context, const auto& record) {
+      return new UploadCall(call, record, server::CreateTrainingJob(std::move(context)), context_.io,
                             response);
     });
   }
   ServerUnaryReactor* GetJob(CallbackServerContext* call, const v1::GetJobRequest* request,
                              v1::Job* response) override {
-    return RunUnary(call, context_, Scope::kRead, server::GetJob, request, response);
+    return RunUnary(call, context_, {"GetJob", Scope::kRead}, server::GetJob, request, response);
   }
   ServerUnaryReactor* ListJobs(CallbackServerContext* call, const v1::ListJobsRequest* request,
                                v1::ListJobsResponse* response) override {
-    return RunUnary(call, context_, Scope::kRead, server::ListJobs, request, response);
+    return RunUnary(call, context_, {"ListJobs", Scope::kRead}, server::ListJobs, request, response);
   }
   grpc::ServerWriteReactor<v1::WatchJobResponse>* WatchJob(
       CallbackServerContext* call, const v1::WatchJobRequest* request) override {
     using Reactor = grpc::ServerWriteReactor<v1::WatchJobResponse>;
-    return Admitted<Reactor>(call, context_, Scope::kRead, [&](CallContext context) {
-      return new WatchCall(std::move(context), request->name());
+    return Admitted<Reactor>(call, context_, {"WatchJob", Scope::kRead}, [&](CallContext context, const auto& record) {
+      return new WatchCall(std::move(context), record, request->name());
     });
   }
   ServerUnaryReactor* CancelJob(CallbackServerContext* call, const v1::CancelJobRequest* request,
                                 v1::Job* response) override {
-    return RunUnary(call, context_, Scope::kWrite, server::CancelJob, request, response);
+    return RunUnary(call, context_, {"CancelJob", Scope::kWrite}, server::CancelJob, request, response);
   }
 
  private:

@@ -9,9 +9,9 @@
 #include <utility>
 
 #include "server/executor/background_executor.h"
+#include "server/handlers/call_record.h"
 #include "server/handlers/overload.h"
 #include "server/handlers/stream_handler.h"
-#include "server/status/grpc_status.h"
 
 namespace metaekf::server {
 
@@ -20,25 +20,25 @@ namespace metaekf::server {
 template <class Request, class Response>
 class UploadCall final : public grpc::ServerReadReactor<Request>, private ResponseSink<Response> {
  public:
-  UploadCall(grpc::CallbackServerContext* context,
+  UploadCall(grpc::CallbackServerContext* context, std::shared_ptr<CallRecord> record,
              std::unique_ptr<StreamHandler<Request, Response>> handler,
              BackgroundExecutor& executor, Response* response)
-      : context_(context), handler_(std::move(handler)), executor_(executor), response_(response) {
+      : context_(context), record_(std::move(record)), handler_(std::move(handler)), executor_(executor), response_(response) {
     this->StartRead(&request_);
   }
 
   void OnReadDone(bool ok) override {
-    if (!executor_.Submit([this, ok] { Handle(ok); })) this->Finish(ToGrpcStatus(Overloaded()));
+    if (!executor_.Submit([this, ok] { Handle(ok); })) this->Finish(record_->End(Overloaded()));
   }
   void OnCancel() override { cancelled_ = true; }
   void OnDone() override { delete this; }
 
  private:
   void Handle(bool is_request) {
-    if (cancelled()) return this->Finish(grpc::Status::CANCELLED);
+    if (cancelled()) return this->Finish(record_->End(absl::CancelledError("the call was cancelled")));
     const absl::Status status = RunHandler(is_request);
     if (is_request && status.ok()) return this->StartRead(&request_);
-    this->Finish(ToGrpcStatus(status));
+    this->Finish(record_->End(status));
   }
 
   absl::Status RunHandler(bool is_request) {
@@ -51,6 +51,7 @@ class UploadCall final : public grpc::ServerReadReactor<Request>, private Respon
   bool cancelled() override { return cancelled_ || context_->IsCancelled(); }
 
   grpc::CallbackServerContext* const context_;
+  const std::shared_ptr<CallRecord> record_;
   const std::unique_ptr<StreamHandler<Request, Response>> handler_;
   BackgroundExecutor& executor_;
   Response* const response_;

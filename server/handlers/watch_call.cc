@@ -3,12 +3,11 @@
 #include "server/convert/jobs.h"
 #include "server/handlers/overload.h"
 #include "server/names/resource_names.h"
-#include "server/status/grpc_status.h"
 
 namespace metaekf::server {
 
-WatchCall::WatchCall(CallContext context, const std::string& name)
-    : context_(std::move(context)) {
+WatchCall::WatchCall(CallContext context, std::shared_ptr<CallRecord> record, const std::string& name)
+    : context_(std::move(context)), record_(std::move(record)) {
   const auto job = ParseJobName("name", name);
   if (!job.ok()) {
     FinishWith(job.status());
@@ -56,7 +55,7 @@ void WatchCall::Advance(std::unique_lock<std::mutex> lock) {
   state_ = stop ? State::kFinished : State::kBusy;
   changed_ = false;
   lock.unlock();
-  if (stop) return Finish(ToGrpcStatus(*stop));
+  if (stop) return Finish(record_->End(*stop));
   if (!context_.server.io.Submit([this] { Look(); })) FinishWith(Overloaded());
 }
 
@@ -83,7 +82,7 @@ void WatchCall::FinishWith(const absl::Status& status) {
     std::lock_guard lock(mutex_);
     state_ = State::kFinished;
   }
-  Finish(ToGrpcStatus(status));
+  Finish(record_->End(status));
 }
 
 }  // namespace metaekf::server

@@ -9,6 +9,7 @@
 
 #include "metaekf/v1/training.pb.h"
 #include "server/handlers/call_context.h"
+#include "server/handlers/call_record.h"
 
 namespace metaekf::server {
 
@@ -16,7 +17,7 @@ namespace metaekf::server {
 /// the client reads are told together. Owns itself until the call is done.
 class WatchCall final : public grpc::ServerWriteReactor<v1::WatchJobResponse> {
  public:
-  WatchCall(CallContext context, const std::string& name);
+  WatchCall(CallContext context, std::shared_ptr<CallRecord> record, const std::string& name);
 
   void OnWriteDone(bool ok) override;
   void OnCancel() override;
@@ -34,6 +35,7 @@ class WatchCall final : public grpc::ServerWriteReactor<v1::WatchJobResponse> {
   void FinishWith(const absl::Status& status);
 
   CallContext context_;
+  const std::shared_ptr<CallRecord> record_;
   int64_t job_ = 0;
   std::optional<int64_t> subscription_;
 

@@ -161,4 +161,11 @@ void ModelCache::Keep(const Model& model) {
   }
 }
 
+ModelCache::Resident ModelCache::resident() {
+  std::lock_guard lock(mutex_);
+  Resident resident{.kept_bytes = recent_bytes_};
+  for (const auto& [key, model] : known_) resident.models += !model.expired();
+  return resident;
+}
+
 }  // namespace metaekf::server

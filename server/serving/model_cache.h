@@ -50,6 +50,13 @@ class ModelCache {
   absl::StatusOr<Model> Get(const std::string& tenant, const std::string& field,
                             const std::string& target);
 
+  /// Models in memory, whoever holds them.
+  struct Resident {
+    int64_t models = 0;
+    int64_t kept_bytes = 0;  ///< of those kept by the cache
+  };
+  Resident resident();
+
  private:
   using Loaded = absl::StatusOr<Model>;
 

@@ -9,9 +9,9 @@
 #include "core/base/status.h"
 #include "server/handlers/overload.h"
 #include "server/handlers/unary_call.h"
+#include "server/metrics/metrics.h"
 #include "server/names/resource_names.h"
 #include "server/status/details.h"
-#include "server/status/grpc_status.h"
 
 namespace metaekf::server {
 
@@ -37,8 +37,14 @@ absl::Status Draining(uint64_t durable_seq) {
 /// applied without it.
 class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse> {
  public:
-  EstimateStream(EstimationService* service, grpc::CallbackServerContext* context, Caller caller)
-      : service_(*service), context_(context), caller_(std::move(caller)) {}
+  EstimateStream(EstimationService* service, grpc::CallbackServerContext* context, std::shared_ptr<CallRecord> record,
+                 Caller caller)
+      : service_(*service),
+        context_(context),
+        record_(std::move(record)),
+        caller_(std::move(caller)),
+        rate_(service->rates_.Of(caller_.tenant)),
+        counters_(service->server_.metrics->OfStreams(caller_.tenant)) {}
 
   void Start(bool draining) {
     std::lock_guard lock(mutex_);
@@ -48,6 +54,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
 
   void OnReadDone(bool ok) override {
     std::lock_guard lock(mutex_);
+    read_time_ = steady_clock::now();
     reading_ = false;
     (ok ? has_request_ : half_closed_) = true;
     Advance();
@@ -119,12 +126,15 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
     if (finish_with_) {
       if (writing_) return;
       finished_ = true;
-      Finish(ToGrpcStatus(*finish_with_));
+      Finish(record_->End(*finish_with_));
       return;
     }
-    if (has_request_ && !writing_ && !stop_applying_) {
+    // Beyond its tenant's rate a request waits, and with it the client; the next sweep looks again.
+    const bool may_work = rate_ == nullptr || rate_->IsReady(steady_clock::now());
+    if (has_request_ && !writing_ && !stop_applying_ && may_work) {
       has_request_ = false;
       request_.Swap(&work_);
+      work_time_ = read_time_;
       working_ = true;
       StartWork();
       return;
@@ -190,6 +200,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   /// With mutex_ held.
   void WorkDone(const absl::Status& status) {
     working_ = false;
+    if (status.ok() && response_.estimates().nis_size() > 0) Count(response_.estimates());
     if (!status.ok()) {
       End(status);
     } else if (response_.kind_case() != v1::EstimateResponse::KIND_NOT_SET && !finish_with_) {
@@ -198,6 +209,19 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
       StartWrite(&response_);
     }
     Advance();
+  }
+
+  /// With mutex_ held, after each batch.
+  void Count(const v1::EstimateBatch& estimates) {
+    const steady_clock::time_point now = steady_clock::now();
+    int64_t gated = 0, resets = 0;
+    for (const uint32_t flags : estimates.flags()) {
+      gated += (flags & v1::EstimateBatch::GATED) != 0;
+      resets += (flags & v1::EstimateBatch::RESET) != 0;
+    }
+    const absl::Span<const double> nis(estimates.nis().data(), static_cast<size_t>(estimates.nis_size()));
+    service_.server_.metrics->CountBatch(counters_, nis, gated, resets, absl::FromChrono(now - work_time_));
+    if (rate_ != nullptr) rate_->Count(estimates.nis_size(), now);
   }
 
   absl::Status OpenOrResume() {
@@ -270,7 +294,10 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
 
   EstimationService& service_;
   grpc::CallbackServerContext* const context_;
+  const std::shared_ptr<CallRecord> record_;
   const Caller caller_;  // and not what its tenant has: streams are many, and need it once
+  SampleRate* const rate_;  // of its tenant; null: as fast as it likes
+  const StreamCounters counters_;
   v1::EstimateRequest request_;    // being read, or waiting
   v1::EstimateRequest work_;       // being worked on
   v1::EstimateResponse response_;  // being made or written
@@ -287,11 +314,13 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   bool stop_applying_ = false;
   bool finished_ = false;
   std::optional<absl::Status> finish_with_;
+  steady_clock::time_point read_time_;   // of request_
+  steady_clock::time_point work_time_;   // when work_ was read
   steady_clock::time_point write_start_;
 };
 
 EstimationService::EstimationService(const ServiceContext& server, SessionManager& sessions)
-    : server_(server), sessions_(sessions), heavy_({.threads = 2, .max_queued = std::numeric_limits<size_t>::max()}), sweeps_([this] { RunSweeps(); }) {}
+    : server_(server), sessions_(sessions), rates_(server.options.quotas), heavy_({.threads = 2, .max_queued = std::numeric_limits<size_t>::max()}), sweeps_([this] { RunSweeps(); }) {}
 
 EstimationService::~EstimationService() {
   {
@@ -305,8 +334,8 @@ EstimationService::~EstimationService() {
 grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse>* EstimationService::Estimate(
     grpc::CallbackServerContext* context) {
   using Reactor = grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse>;
-  return Admitted<Reactor>(context, server_, store::Scope::kStream, [&](CallContext admitted) {
-    auto* stream = new EstimateStream(this, context, std::move(admitted.caller));
+  return Admitted<Reactor>(context, server_, {"Estimate", store::Scope::kStream}, [&](CallContext admitted, const auto& record) {
+    auto* stream = new EstimateStream(this, context, record, std::move(admitted.caller));
     bool draining;
     {
       std::lock_guard lock(mutex_);
@@ -354,15 +383,15 @@ void EstimationService::Drain(steady_clock::time_point deadline) {
 }
 
 template <class Work>
-grpc::ServerUnaryReactor* EstimationService::Answer(grpc::CallbackServerContext* context, store::Scope scope, const Work& work) {
-  return Admitted<grpc::ServerUnaryReactor>(context, server_, scope, [&](CallContext caller) {
-    return FinishWith(context, server_.io, [work, caller = std::move(caller)]() mutable { return work(caller.store); });
+grpc::ServerUnaryReactor* EstimationService::Answer(grpc::CallbackServerContext* context, const Rpc& rpc, const Work& work) {
+  return Admitted<grpc::ServerUnaryReactor>(context, server_, rpc, [&](CallContext caller, const auto& record) {
+    return FinishWith(context, record, server_.io, [work, caller = std::move(caller)]() mutable { return work(caller.store); });
   });
 }
 
 grpc::ServerUnaryReactor* EstimationService::GetSession(grpc::CallbackServerContext* context,
                                                         const v1::GetSessionRequest* request, v1::Session* response) {
-  return Answer(context, store::Scope::kRead, [this, request, response](store::TenantStore& mine) -> absl::Status {
+  return Answer(context, {"GetSession", store::Scope::kRead}, [this, request, response](store::TenantStore& mine) -> absl::Status {
     METAEKF_ASSIGN_OR_RETURN(*response, sessions_.Get(mine, request->name()));
     return absl::OkStatus();
   });
@@ -371,7 +400,7 @@ grpc::ServerUnaryReactor* EstimationService::GetSession(grpc::CallbackServerCont
 grpc::ServerUnaryReactor* EstimationService::ListSessions(grpc::CallbackServerContext* context,
                                                           const v1::ListSessionsRequest* request,
                                                           v1::ListSessionsResponse* response) {
-  return Answer(context, store::Scope::kRead, [this, request, response](store::TenantStore& mine) -> absl::Status {
+  return Answer(context, {"ListSessions", store::Scope::kRead}, [this, request, response](store::TenantStore& mine) -> absl::Status {
     METAEKF_ASSIGN_OR_RETURN(*response, sessions_.List(mine, *request));
     return absl::OkStatus();
   });
@@ -380,7 +409,7 @@ grpc::ServerUnaryReactor* EstimationService::ListSessions(grpc::CallbackServerCo
 grpc::ServerUnaryReactor* EstimationService::DeleteSession(grpc::CallbackServerContext* context,
                                                            const v1::DeleteSessionRequest* request,
                                                            google::protobuf::Empty*) {
-  return Answer(context, store::Scope::kStream, [this, request](store::TenantStore& mine) { return sessions_.Delete(mine, request->name()); });
+  return Answer(context, {"DeleteSession", store::Scope::kStream}, [this, request](store::TenantStore& mine) { return sessions_.Delete(mine, request->name()); });
 }
 
 }  // namespace metaekf::server

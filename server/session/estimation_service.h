@@ -10,11 +10,13 @@
 #include "metaekf/v1/estimation.grpc.pb.h"
 #include "server/executor/background_executor.h"
 #include "server/handlers/service_context.h"
+#include "server/session/sample_rate.h"
 #include "server/session/session_manager.h"
 
 namespace metaekf::server {
 
 class EstimateStream;
+struct Rpc;
 
 /// The EstimationService of the wire over a SessionManager.
 class EstimationService : public v1::EstimationService::CallbackService {
@@ -40,7 +42,7 @@ class EstimationService : public v1::EstimationService::CallbackService {
   friend class EstimateStream;
   /// Answers with what `work` makes of the caller's part of the store.
   template <class Work>
-  grpc::ServerUnaryReactor* Answer(grpc::CallbackServerContext* context, store::Scope scope, const Work& work);
+  grpc::ServerUnaryReactor* Answer(grpc::CallbackServerContext* context, const Rpc& rpc, const Work& work);
   void Remove(EstimateStream* stream);
   /// Has batches that wait applied.
   void WorkThrough(const std::shared_ptr<BatchQueue>& queue);
@@ -48,6 +50,7 @@ class EstimationService : public v1::EstimationService::CallbackService {
 
   const ServiceContext& server_;
   SessionManager& sessions_;
+  SampleRates rates_;
   BackgroundExecutor heavy_;  // batches that take longer than a reaction may; each stream has one at most
 
   std::mutex mutex_;

@@ -56,6 +56,26 @@ absl::StatusOr<MatrixXd> NoiseOf(const v1::SampleBatch& batch, int64_t rows, int
   return ReadCovariance("samples.measurement_noise_covs", batch.measurement_noise_covs().data() + row * width, width, n_y);
 }
 
+/// No sensor and no unit is this far off, in scales of what the model was trained on: a filter could only diverge.
+constexpr double kFarthest = 1e9;
+
+absl::Status CheckValues(const char* field, const google::protobuf::RepeatedField<double>& values,
+                         const data::ChannelScaling& scaling, bool may_be_missing) {
+  for (int i = 0; i < values.size(); ++i) {
+    const double value = values[i];
+    if (may_be_missing && std::isnan(value)) continue;
+    const Eigen::Index channel = i % scaling.mean.size();
+    const bool finite = std::isfinite(value);
+    if (finite && std::abs(value - scaling.mean[channel]) <= kFarthest * scaling.scale[channel]) continue;
+    const char* missing = may_be_missing ? ", or NaN if it was not measured" : "";
+    return FieldViolation(absl::StrCat(field, "[", i, "]"),
+                          finite ? absl::StrCat("is ", base::FormatExact(value), ", more than 1e9 times as far from the mean as what the model was "
+                                                "trained on; it must be a measured value in the model's unit", missing)
+                                 : absl::StrCat("must be finite", missing, ", got ", base::FormatExact(value)));
+  }
+  return absl::OkStatus();
+}
+
 }  // namespace
 
 absl::StatusOr<std::unique_ptr<Session>> Session::Open(std::shared_ptr<const ServedModel> model,
@@ -117,17 +137,9 @@ absl::Status Session::Check(const v1::SampleBatch& batch, int64_t rows) const {
   if (!batch.times_s().empty() && batch.times_s_size() != rows) {
     return FieldViolation("samples.times_s", absl::StrCat("expected ", rows, " values or none, got ", batch.times_s_size()));
   }
-  for (int i = 0; i < batch.inputs_size(); ++i) {
-    if (!std::isfinite(batch.inputs(i))) {
-      return FieldViolation(absl::StrCat("samples.inputs[", i, "]"), absl::StrCat("must be finite, got ", base::FormatExact(batch.inputs(i))));
-    }
-  }
-  for (int i = 0; i < batch.outputs_size(); ++i) {
-    if (std::isinf(batch.outputs(i))) {
-      return FieldViolation(absl::StrCat("samples.outputs[", i, "]"),
-                            absl::StrCat("must be finite, or NaN if not measured, got ", base::FormatExact(batch.outputs(i))));
-    }
-  }
+  const data::Normaliser& normaliser = model_->bundle.normaliser;
+  METAEKF_RETURN_IF_ERROR(CheckValues("samples.inputs", batch.inputs(), normaliser.inputs, false));
+  METAEKF_RETURN_IF_ERROR(CheckValues("samples.outputs", batch.outputs(), normaliser.outputs, true));
   if (batch.first_seq() == 0) return FieldViolation("samples.first_seq", "samples are numbered from 1");
   if (batch.first_seq() > seq_ + 1) {
     return WithReason(absl::OutOfRangeError(absl::StrCat("samples.first_seq: expected ", seq_ + 1, ", got ", batch.first_seq())),

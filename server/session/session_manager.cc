@@ -4,6 +4,7 @@
 
 #include <chrono>
 
+#include "absl/time/clock.h"
 #include "core/base/status.h"
 #include "server/convert/time.h"
 #include "server/names/resource_names.h"
@@ -16,8 +17,8 @@ constexpr std::chrono::milliseconds kCommitPeriod(100);
 
 }  // namespace
 
-SessionManager::SessionManager(store::Store& store, ModelCache& models)
-    : store_(store), models_(models), checkpoints_([this] { RunCheckpoints(); }) {}
+SessionManager::SessionManager(store::Store& store, ModelCache& models, std::shared_ptr<Metrics> metrics)
+    : store_(store), models_(models), metrics_(std::move(metrics)), checkpoints_([this] { RunCheckpoints(); }) {}
 
 SessionManager::~SessionManager() {
   {
@@ -105,6 +106,7 @@ std::shared_ptr<BatchQueue> SessionManager::QueueOf(const std::shared_ptr<const 
 
 void SessionManager::MarkDirty(const std::shared_ptr<LiveSession>& live) {
   std::lock_guard lock(mutex_);
+  if (dirty_.empty()) dirty_since_ = absl::Now();
   dirty_.insert(live);
 }
 
@@ -121,6 +123,7 @@ void SessionManager::Flush() {
     std::lock_guard lock(mutex_);
     sessions.assign(dirty_.begin(), dirty_.end());
     dirty_.clear();
+    flushed_since_ = std::exchange(dirty_since_, absl::InfiniteFuture());
   }
   if (sessions.empty()) return;
   std::vector<store::SessionCheckpoint> checkpoints;
@@ -129,7 +132,13 @@ void SessionManager::Flush() {
     checkpoints.push_back({live->tenant, live->number, static_cast<int64_t>(live->epoch),
                            static_cast<int64_t>(live->session->applied_seq()), live->session->Checkpoint()});
   }
+  const absl::Time start = absl::Now();
   const absl::StatusOr<std::vector<bool>> written = store_.SaveCheckpoints(checkpoints);
+  {
+    std::lock_guard lock(mutex_);
+    const absl::Time since = std::exchange(flushed_since_, absl::InfiniteFuture());
+    if (!written.ok()) dirty_since_ = std::min(dirty_since_, since);
+  }
   if (!written.ok()) {
     // Nothing became durable; clients keep their samples. The next commit tries again.
     spdlog::error("checkpoints of {} sessions not written: {}", sessions.size(), written.status().ToString());
@@ -137,6 +146,7 @@ void SessionManager::Flush() {
     dirty_.insert(sessions.begin(), sessions.end());
     return;
   }
+  metrics_->CountCheckpoints(static_cast<int64_t>(sessions.size()), absl::Now() - start);
   for (size_t i = 0; i < sessions.size(); ++i) {
     std::lock_guard lock(sessions[i]->mutex);
     if ((*written)[i]) {
@@ -145,6 +155,19 @@ void SessionManager::Flush() {
       sessions[i]->taken_over = true;
     }
   }
+}
+
+std::map<std::string, int64_t> SessionManager::CountStreaming() {
+  std::lock_guard lock(mutex_);
+  std::map<std::string, int64_t> counts;
+  for (const auto& [key, live] : live_) ++counts[key.first];
+  return counts;
+}
+
+absl::Duration SessionManager::CheckpointLag() {
+  std::lock_guard lock(mutex_);
+  const absl::Time since = std::min(dirty_since_, flushed_since_);
+  return since == absl::InfiniteFuture() ? absl::ZeroDuration() : absl::Now() - since;
 }
 
 std::shared_ptr<LiveSession> SessionManager::FindLive(const std::string& tenant, int64_t number) {

@@ -10,6 +10,8 @@
 #include <vector>
 
 #include "absl/status/statusor.h"
+#include "absl/time/time.h"
+#include "server/metrics/metrics.h"
 #include "server/serving/model_cache.h"
 #include "server/session/batch_queue.h"
 #include "server/store/store.h"
@@ -20,7 +22,7 @@ namespace metaekf::server {
 /// SQL and files.
 class SessionManager {
  public:
-  SessionManager(store::Store& store, ModelCache& models);
+  SessionManager(store::Store& store, ModelCache& models, std::shared_ptr<Metrics> metrics);
   ~SessionManager();
 
   /// @param mine  of the caller's tenant, here and below.
@@ -33,6 +35,11 @@ class SessionManager {
   void Close(const std::shared_ptr<LiveSession>& live);
   /// Writes what is dirty now.
   void Flush();
+
+  /// What streams have sessions now, by tenant.
+  std::map<std::string, int64_t> CountStreaming();
+  /// How long samples wait, that have been applied, to become durable; 0 if none waits.
+  absl::Duration CheckpointLag();
 
   absl::StatusOr<v1::Session> Get(store::TenantStore& mine, const std::string& name);
   absl::StatusOr<v1::ListSessionsResponse> List(store::TenantStore& mine, const v1::ListSessionsRequest& request);
@@ -50,9 +57,12 @@ class SessionManager {
 
   store::Store& store_;
   ModelCache& models_;
+  const std::shared_ptr<Metrics> metrics_;
   std::mutex mutex_;
   std::map<std::pair<std::string, int64_t>, std::shared_ptr<LiveSession>> live_;  // by tenant and number
   std::set<std::shared_ptr<LiveSession>> dirty_;
+  absl::Time dirty_since_ = absl::InfiniteFuture();  // the first of them
+  absl::Time flushed_since_ = absl::InfiniteFuture();  // the first of those that are being written
   std::vector<std::weak_ptr<BatchQueue>> queues_;
   bool stopping_ = false;
   std::condition_variable stop_;

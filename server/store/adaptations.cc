@@ -88,6 +88,8 @@ absl::StatusOr<Adaptation> AdaptationStore::Create(NewAdaptation wanted) {
                                                    "'; choose another id or delete that one"));
     }
     if (!absl::IsNotFound(taken)) return taken;
+    METAEKF_RETURN_IF_ERROR(CheckMayAdaptation(context_, connection));
+    METAEKF_RETURN_IF_ERROR(CheckMayStore(context_, connection, wanted.file.size_bytes()));
     METAEKF_ASSIGN_OR_RETURN(Adaptation adaptation, Insert(context_, connection, wanted));
     METAEKF_RETURN_IF_ERROR(
         RecordRequest(context_, connection, kRequestKind, wanted.request, {adaptation.id, 0}));

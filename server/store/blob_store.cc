@@ -64,7 +64,10 @@ absl::StatusOr<BlobStore> BlobStore::Open(const std::string& directory) {
   METAEKF_RETURN_IF_ERROR(MakeDirectory(store.tmp_));
   METAEKF_RETURN_IF_ERROR(SyncDirectory(directory));
   METAEKF_ASSIGN_OR_RETURN(const auto left_over, ListDirectory(store.tmp_));
-  for (const std::string& name : left_over) unlink(absl::StrCat(store.tmp_, "/", name).c_str());
+  for (const std::string& name : left_over) {
+    std::error_code ignored;  // the next start tries again
+    std::filesystem::remove_all(absl::StrCat(store.tmp_, "/", name), ignored);
+  }
   return store;
 }
 

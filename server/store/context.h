@@ -9,6 +9,7 @@
 #include "absl/time/time.h"
 #include "server/store/blob_store.h"
 #include "server/store/database.h"
+#include "server/store/quota.h"
 
 namespace metaekf::store {
 
@@ -23,6 +24,7 @@ struct Context {
   std::string jobs_directory;
   std::string tenant;
   std::string identity;
+  Quota quota{};  ///< of the tenant
 };
 
 /// The next number of a kind, from 1; never the same twice. In a write transaction.

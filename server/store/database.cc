@@ -106,6 +106,16 @@ absl::Status Connection::Execute(const std::string& sql, std::initializer_list<V
   return status;
 }
 
+absl::Status Connection::CopyTo(const std::string& path) {
+  METAEKF_ASSIGN_OR_RETURN(const std::unique_ptr<Connection> copy, Open(path, Mode::kReadWrite));
+  sqlite3_backup* backup = sqlite3_backup_init(copy->handle_, "main", handle_, "main");
+  if (backup == nullptr) return copy->Error(sqlite3_errcode(copy->handle_));
+  const int step = sqlite3_backup_step(backup, -1);
+  const int finish = sqlite3_backup_finish(backup);
+  if (step == SQLITE_DONE && finish == SQLITE_OK) return absl::OkStatus();
+  return copy->Error(finish == SQLITE_OK ? step : finish);
+}
+
 int64_t Connection::changes() const { return sqlite3_changes64(handle_); }
 
 absl::Status Connection::Transact(const char* begin,
@@ -151,6 +161,15 @@ absl::Status Database::ReadTransaction(const Transaction& work) {
   std::lock_guard lock(readers_mutex_);
   idle_readers_.push_back(std::move(reader));
   return status;
+}
+
+absl::Status Database::CopyTo(const std::string& path, const Transaction& at_commit) {
+  std::unique_lock no_writes(writer_mutex_);
+  return ReadTransaction([&](Connection& connection) -> absl::Status {
+    METAEKF_RETURN_IF_ERROR(at_commit(connection));
+    no_writes.unlock();  // what is written from here on, this transaction does not see
+    return connection.CopyTo(path);
+  });
 }
 
 }  // namespace metaekf::store

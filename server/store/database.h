@@ -51,6 +51,8 @@ class Connection {
   /// outside, Internal.
   absl::Status Execute(const std::string& sql, std::initializer_list<Value> parameters = {},
                        const std::function<void(const Row&)>& on_row = nullptr);
+  /// Writes all that the current transaction sees into a new database.
+  absl::Status CopyTo(const std::string& path);
   /// Rows that the last INSERT, UPDATE or DELETE changed.
   int64_t changes() const;
 
@@ -86,8 +88,12 @@ class Database {
     return Run(&Database::ReadTransaction, work);
   }
 
- private:
   using Transaction = std::function<absl::Status(Connection&)>;
+
+  /// Writes the last commit into a new database. `at_commit`, which must read something, runs before any later write does.
+  absl::Status CopyTo(const std::string& path, const Transaction& at_commit);
+
+ private:
 
   Database(std::string path, std::unique_ptr<Connection> writer)
       : path_(std::move(path)), writer_(std::move(writer)) {}

@@ -107,6 +107,8 @@ absl::StatusOr<Job> JobStore::Create(NewJob wanted) {
     METAEKF_ASSIGN_OR_RETURN(const auto before,
                              FindRequest(context_, connection, kKind, wanted.request));
     if (before) return FindJob(context_, connection, before->number);
+    METAEKF_RETURN_IF_ERROR(CheckMayQueueJob(context_, connection));
+    METAEKF_RETURN_IF_ERROR(CheckMayStore(context_, connection, wanted.dataset.size_bytes()));
     METAEKF_ASSIGN_OR_RETURN(const int64_t number, NextNumber(context_, connection, kKind));
     METAEKF_RETURN_IF_ERROR(connection.Execute(
         "INSERT INTO jobs (tenant, number, model, spec_json, dataset_digest, state, create_time) "
@@ -169,26 +171,38 @@ absl::StatusOr<std::optional<JobQueue::Claimed>> JobQueue::Claim(const std::stri
                                                                  absl::Duration lease) {
   using Result = absl::StatusOr<std::optional<Claimed>>;
   return context_.database.Write([&](Connection& connection) -> Result {
-    std::optional<Claimed> claimed;
+    std::optional<JobLease> next;
     METAEKF_RETURN_IF_ERROR(connection.Execute(
-        absl::StrCat(kSelect,
-                     "WHERE state = 'QUEUED' ORDER BY (SELECT count(*) FROM jobs AS running WHERE "
-                     "running.tenant = jobs.tenant AND running.state = 'RUNNING'), create_time, "
-                     "number LIMIT 1"),
+        "SELECT tenant, number, attempt, (SELECT count(*) FROM jobs AS others WHERE "
+        "others.tenant = jobs.tenant AND others.state = 'RUNNING') AS running FROM jobs "
+        "WHERE state = 'QUEUED' ORDER BY running, create_time, number",
         {}, [&](const Row& row) {
-          Job job = ReadJob(row);
-          const JobLease taken{row.Text(15), job.number, job.attempt + 1};
-          claimed = Claimed{std::move(job), taken};
+          const bool may = row.Int(3) < quotas_.Of(row.Text(0)).running_jobs;
+          if (!next && may) next = JobLease{row.Text(0), row.Int(1), row.Int(2) + 1};
         }));
-    if (!claimed) return std::nullopt;
-    Job& job = claimed->job;
+    if (!next) return std::nullopt;
+    METAEKF_ASSIGN_OR_RETURN(Job job, FindJob(Of(next->tenant), connection, next->number));
     job.state = JobState::kRunning;
     ++job.attempt;
     job.worker = worker;
     job.start_time = context_.clock();
     job.lease_end = job.start_time + lease;
-    METAEKF_RETURN_IF_ERROR(Update(Of(claimed->lease.tenant), connection, job));
-    return claimed;
+    METAEKF_RETURN_IF_ERROR(Update(Of(next->tenant), connection, job));
+    return Claimed{std::move(job), *next};
+  });
+}
+
+absl::StatusOr<std::vector<JobQueue::Claimed>> JobQueue::ListRunning() {
+  using Running = absl::StatusOr<std::vector<Claimed>>;
+  return context_.database.Read([&](Connection& connection) -> Running {
+    std::vector<Claimed> running;
+    METAEKF_RETURN_IF_ERROR(connection.Execute(
+        absl::StrCat(kSelect, "WHERE state = 'RUNNING' ORDER BY create_time, number"), {}, [&](const Row& row) {
+          Job job = ReadJob(row);
+          const JobLease lease{row.Text(15), job.number, job.attempt};
+          running.push_back({std::move(job), lease});
+        }));
+    return running;
   });
 }
 

@@ -4,6 +4,7 @@
 #include <functional>
 #include <optional>
 #include <string>
+#include <vector>
 
 #include "server/store/models.h"
 
@@ -51,7 +52,7 @@ class JobStore {
   explicit JobStore(Context context) : context_(std::move(context)) {}
 
   /// Errors: InvalidArgument for a bad model name; AlreadyExists if the request.id was used with
-  /// another fingerprint.
+  /// another fingerprint; those of quota.h.
   absl::StatusOr<Job> Create(NewJob job);
   absl::StatusOr<Job> Get(int64_t number);
   /// Newest first.
@@ -73,17 +74,20 @@ class JobQueue {
   /// A job whose attempts are lost this often in a row without a new checkpoint has failed.
   static constexpr int64_t kMaxFailures = 3;
 
-  /// @param context  of any tenant.
-  explicit JobQueue(Context context) : context_(std::move(context)) {}
+  /// @param context  of any tenant. @param quotas  outlive the queue.
+  JobQueue(Context context, const Quotas& quotas) : context_(std::move(context)), quotas_(quotas) {}
 
   struct Claimed {
     Job job;
     JobLease lease;
   };
   /// Gives a queued job to a worker, nothing if none is queued: the oldest of the tenants that have
-  /// fewest running, so that none waits for all jobs of another.
+  /// fewest running, so that none waits for all jobs of another; and of none that has as many running as its quota lets
+  /// it.
   /// @param worker  unique per start of a worker.
   absl::StatusOr<std::optional<Claimed>> Claim(const std::string& worker, absl::Duration lease);
+  /// All that run now, the oldest first.
+  absl::StatusOr<std::vector<Claimed>> ListRunning();
   /// Extends the lease and tells the progress.
   /// @param checkpointed  a checkpoint was written since the last call: the attempt got somewhere.
   absl::Status Renew(const JobLease& lease, absl::Duration duration,
@@ -116,6 +120,7 @@ class JobQueue {
                          const std::function<absl::Status(const Context&, Connection&, Job&)>& work);
 
   Context context_;
+  const Quotas& quotas_;
 };
 
 /// The name of a job's directory. No two tenants share one: numbers have no dash.

@@ -100,6 +100,7 @@ absl::StatusOr<ModelVersion> ModelStore::AddVersion(const std::string& model, St
     METAEKF_ASSIGN_OR_RETURN(const auto before,
                              FindRequest(context_, connection, kRequestKind, request));
     if (before) return FindVersion(context_, connection, before->name, before->number);
+    METAEKF_RETURN_IF_ERROR(CheckMayStore(context_, connection, file.size_bytes()));
     METAEKF_ASSIGN_OR_RETURN(ModelVersion version,
                              InsertVersion(context_, connection, model, file, metadata_json));
     METAEKF_RETURN_IF_ERROR(

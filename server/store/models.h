@@ -41,7 +41,7 @@ class ModelStore {
   explicit ModelStore(Context context) : context_(std::move(context)) {}
 
   /// Adds a version to a model, which is made if there is none yet; all or nothing.
-  /// Errors: AlreadyExists if request.id was used with another fingerprint.
+  /// Errors: AlreadyExists if request.id was used with another fingerprint; those of quota.h.
   absl::StatusOr<ModelVersion> AddVersion(const std::string& model, StagedBlob file,
                                           const std::string& metadata_json,
                                           const RequestId& request = {});

@@ -40,6 +40,7 @@ absl::StatusOr<NewSession> SessionStore::Create(const std::string& target,
                                                 const std::string& settings) {
   METAEKF_ASSIGN_OR_RETURN(const std::string token, NewSecret());
   return context_.database.Write([&](Connection& connection) -> absl::StatusOr<NewSession> {
+    METAEKF_RETURN_IF_ERROR(CheckMaySession(context_, connection));
     METAEKF_ASSIGN_OR_RETURN(const int64_t number, NextNumber(context_, connection, "session"));
     const int64_t now = absl::ToUnixMicros(context_.clock());
     METAEKF_RETURN_IF_ERROR(connection.Execute(

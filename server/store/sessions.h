@@ -39,7 +39,7 @@ class SessionStore {
  public:
   explicit SessionStore(Context context) : context_(std::move(context)) {}
 
-  /// Makes a session and claims it: epoch 1.
+  /// Makes a session and claims it: epoch 1. Errors: those of quota.h.
   absl::StatusOr<NewSession> Create(const std::string& target, const std::string& settings);
 
   /// Takes the session: its next epoch.

@@ -100,7 +100,8 @@ absl::StatusOr<OwnedFiles> ListFiles(Connection& connection, const std::string& 
 
 }  // namespace
 
-absl::StatusOr<std::unique_ptr<Store>> Store::Open(const std::string& directory, Clock clock) {
+absl::StatusOr<std::unique_ptr<Store>> Store::Open(const std::string& directory, Clock clock,
+                                                    const Quotas& quotas) {
   METAEKF_RETURN_IF_ERROR(MakeDirectory(directory));
   METAEKF_ASSIGN_OR_RETURN(UniqueFd lock, Lock(directory));
   METAEKF_ASSIGN_OR_RETURN(BlobStore blobs, BlobStore::Open(directory));
@@ -111,25 +112,27 @@ absl::StatusOr<std::unique_ptr<Store>> Store::Open(const std::string& directory,
   if (!database.ok()) return base::Annotate(database.status(), directory);
   METAEKF_RETURN_IF_ERROR(base::Annotate(PrepareSchema(**database), directory));
   std::unique_ptr<Store> store(new Store(directory, std::move(lock), std::move(blobs),
-                                         *std::move(database), std::move(clock)));
+                                         *std::move(database), std::move(clock), quotas));
   METAEKF_RETURN_IF_ERROR(store->CollectGarbage());
   return store;
 }
 
 Store::Store(const std::string& directory, UniqueFd lock, BlobStore blobs,
-             std::unique_ptr<Database> database, Clock clock)
+             std::unique_ptr<Database> database, Clock clock, const Quotas& quotas)
     : directory_(directory),
+      quotas_(quotas),
       lock_(std::move(lock)),
       blobs_(std::move(blobs)),
       database_(std::move(database)),
       context_{*database_, blobs_, std::move(clock), JobsDirectory(directory), "", "server"},
-      job_queue_(context_),
+      job_queue_(context_, quotas_),
       audit_(context_) {}
 
 TenantStore Store::Of(const std::string& tenant, const std::string& identity) {
   Context context = context_;
   context.tenant = tenant;
   context.identity = identity;
+  context.quota = quotas_.Of(tenant);
   return TenantStore(context);
 }
 
@@ -165,6 +168,65 @@ absl::Status Store::CollectGarbage() {
       std::filesystem::remove_all(absl::StrCat(context_.jobs_directory, "/", name), ignored);
     }
     return absl::OkStatus();
+  });
+}
+
+absl::StatusOr<std::unique_ptr<Backup>> Store::MakeBackup(const std::string& identity) {
+  std::string directory = directory_ + "/tmp/backup-XXXXXX";
+  if (mkdtemp(directory.data()) == nullptr) return ErrnoStatus(errno, "cannot make a directory for the backup");
+  auto backup = std::make_unique<Backup>(directory);
+  METAEKF_RETURN_IF_ERROR(MakeDirectory(directory + "/blobs"));
+  Context context = context_;
+  context.identity = identity;
+  METAEKF_RETURN_IF_ERROR(database_->Write(
+      [&](Connection& connection) { return Audit(context, connection, "CreateBackup", "backup"); }));
+
+  std::vector<std::string> digests;
+  METAEKF_RETURN_IF_ERROR(database_->CopyTo(DatabasePath(directory), [&](Connection& connection) -> absl::Status {
+    METAEKF_ASSIGN_OR_RETURN(digests, ReferencedBlobs(connection));
+    for (const std::string& digest : digests) {
+      // One that is gone is missed by whoever reads the backup.
+      const std::string to = absl::StrCat(directory, "/blobs/", digest);
+      if (link(blobs_.Path(digest).c_str(), to.c_str()) != 0 && errno != ENOENT) {
+        return ErrnoStatus(errno, "cannot keep a file for the backup");
+      }
+    }
+    return absl::OkStatus();
+  }));
+  METAEKF_ASSIGN_OR_RETURN(const std::string database, ReadFile(DatabasePath(directory)));
+  backup->files_.push_back({"metaekf.db", static_cast<int64_t>(database.size()), Sha256Hex(database)});
+  for (const std::string& digest : digests) {
+    std::error_code gone;
+    const uintmax_t size = std::filesystem::file_size(absl::StrCat(directory, "/blobs/", digest), gone);
+    backup->files_.push_back({absl::StrCat("blobs/", digest), gone ? 0 : static_cast<int64_t>(size), digest});
+  }
+  return backup;
+}
+
+absl::StatusOr<std::map<std::string, Usage>> Store::TakeUsage() {
+  using Usages = std::map<std::string, Usage>;
+  return database_->Read([](Connection& connection) -> absl::StatusOr<Usages> {
+    Usages usages;
+    METAEKF_RETURN_IF_ERROR(connection.Execute("SELECT tenant, count(*) FROM sessions GROUP BY tenant", {},
+                                               [&](const Row& row) { usages[row.Text(0)].sessions = row.Int(1); }));
+    METAEKF_RETURN_IF_ERROR(connection.Execute("SELECT tenant, count(*), total(size_bytes) FROM adaptations GROUP BY tenant", {},
+                                               [&](const Row& row) {
+                                                 usages[row.Text(0)].adaptations = row.Int(1);
+                                                 usages[row.Text(0)].stored_bytes += row.Int(2);
+                                               }));
+    METAEKF_RETURN_IF_ERROR(connection.Execute("SELECT tenant, count(*), total(size_bytes) FROM versions GROUP BY tenant", {},
+                                               [&](const Row& row) {
+                                                 usages[row.Text(0)].versions = row.Int(1);
+                                                 usages[row.Text(0)].stored_bytes += row.Int(2);
+                                               }));
+    METAEKF_RETURN_IF_ERROR(connection.Execute(
+        "SELECT tenant, total(state = 'QUEUED'), total(state = 'RUNNING') FROM jobs "
+        "WHERE state IN ('QUEUED', 'RUNNING') GROUP BY tenant",
+        {}, [&](const Row& row) {
+          usages[row.Text(0)].queued_jobs = row.Int(1);
+          usages[row.Text(0)].running_jobs = row.Int(2);
+        }));
+    return usages;
   });
 }
 

@@ -10,7 +10,6 @@
 namespace metaekf::store {
 namespace {
 
-constexpr const char* kScopeNames[] = {"read", "stream", "write", "admin"};
 // Of all secrets, so that one found where it should not be is known for what it is.
 constexpr const char* kPrefix = "metaekf_";
 constexpr const char* kSelect =
@@ -43,16 +42,6 @@ absl::StatusOr<Token> FindToken(Connection& connection, const std::string& id) {
 }
 
 }  // namespace
-
-const char* ScopeName(Scope scope) { return kScopeNames[static_cast<int>(scope)]; }
-
-absl::StatusOr<Scope> ScopeNamed(const std::string& name) {
-  for (const Scope scope : {Scope::kRead, Scope::kStream, Scope::kWrite, Scope::kAdmin}) {
-    if (name == ScopeName(scope)) return scope;
-  }
-  return absl::InvalidArgumentError(
-      absl::StrCat("scope '", name, "' is none of read, stream, write and admin"));
-}
 
 absl::StatusOr<NewToken> TokenStore::Create(const std::string& tenant, Scope scope,
                                             absl::Duration lifetime, const std::string& note) {

@@ -310,7 +310,7 @@ class EstimationService : public v1::EstimationService::Service {
     stream->Read(&request);
     if (request.has_open()) fake_.open = request.open();
     if (request.open().target() == "models/gone") return NotFound("model", "gone");
-    if (request.has_resume() && request.resume().token() != "secret") {
+    if (request.has_resume() && request.resume().token() != fake_.secret) {
       return NotFound("session", request.resume().session());
     }
     stream->Write(Opened(request.has_open()));
@@ -327,6 +327,7 @@ class EstimationService : public v1::EstimationService::Service {
       fake_.batches.push_back(request.samples());
       stream->Write(Answer(request.samples()));
       if (fake_.stop_after_batches > 0 && --fake_.stop_after_batches == 0) {
+        fake_.stop_after_batches = fake_.then_stop_after_batches;
         google::rpc::ErrorInfo info;
         info.set_reason("DRAINING");
         return WithDetail(grpc::StatusCode::UNAVAILABLE, "the server stops", info);

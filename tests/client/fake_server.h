@@ -69,11 +69,13 @@ struct FakeEstimation {
   v1::OpenSession open;
   v1::Channel estimated;
   std::vector<v1::SampleBatch> batches;
+  std::string secret = "secret";
   uint64_t epoch = 0;
   uint64_t durable_seq = 0;
   double last_mean = 0;
   bool make_durable = false;   // every answered batch but the latest
-  int stop_after_batches = 0;  // 0: never
+  int stop_after_batches = 0;       // 0: never
+  int then_stop_after_batches = 0;  // each time after the first
 };
 
 /// Estimates as those of FakeEstimation, all in one response.

@@ -98,7 +98,7 @@ struct ServerInfo {
   Time start_time;
   uint32_t data_format_version = 0;
   uint64_t stored_bytes = 0;
-  uint64_t free_disk_bytes = 0;
+  std::optional<uint64_t> free_disk_bytes;  ///< told to who looks after the server
   std::vector<std::string> problems;  ///< of stored files, one sentence each
   uint32_t models = 0, model_versions = 0, adaptations = 0, sessions = 0;
   uint32_t queued_jobs = 0, running_jobs = 0, ended_jobs = 0;
@@ -130,6 +130,87 @@ struct ModelVersion {
   uint64_t parameter_count = 0;
   std::optional<double> validation_loss;  ///< normalised units
   std::string training_job;               ///< empty: imported
+};
+
+/// What a client may do; each may do what those before it may.
+enum class Scope {
+  kRead,    ///< look, predict
+  kStream,  ///< have sessions of estimates
+  kWrite,   ///< make, change and delete what its tenant has
+  kAdmin,   ///< look after the server
+};
+
+/// A bearer token, without its secret.
+struct Token {
+  std::string id;
+  std::string tenant;  ///< whose things its holder works with
+  Scope scope = Scope::kRead;
+  std::string note;
+  Time create_time;
+  std::optional<Time> expire_time, revoke_time;
+};
+
+struct TokenRequest {
+  std::string tenant;  ///< empty: "default"
+  Scope scope = Scope::kRead;
+  std::optional<double> lifetime_s;  ///< nothing: it does not expire
+  std::string note;                  ///< for whom it is
+};
+
+struct NewToken {
+  Token token;
+  std::string secret;  ///< what its holder shows; the server does not keep it
+};
+
+/// Who did what, when.
+struct AuditEntry {
+  uint64_t number = 0;  ///< from 1 up
+  Time time;
+  std::string tenant, identity, action, resource, detail;
+};
+
+/// What a backup holds.
+struct BackupInfo {
+  std::string server_version;
+  uint32_t data_format_version = 0;
+  Time create_time;
+  uint32_t files = 0;
+  uint64_t size_bytes = 0;
+};
+
+struct BackupFile {
+  std::string path;  ///< metaekf.db, or blobs/{sha256}
+  uint64_t size_bytes = 0;
+  std::string sha256;  ///< of its bytes; one that the server has lost has none
+};
+
+/// Receives a backup: Begin, then each File followed by its bytes. An error of any ends it.
+class BackupSink {
+ public:
+  virtual ~BackupSink() = default;
+  virtual Status Begin(const BackupInfo& info) = 0;
+  virtual Status File(const BackupFile& file) = 0;
+  virtual Status Bytes(const std::string& bytes) = 0;
+};
+
+/// One value that a server counts or measures; of several, their distribution.
+struct Metric {
+  std::map<std::string, std::string> labels;
+  double value = 0;
+  /// Of a histogram: how many values, their sum, and how many are at most each bound, the last of which is infinite.
+  struct Histogram {
+    uint64_t count = 0;
+    double sum = 0;
+    std::vector<double> upper_bounds;
+    std::vector<uint64_t> cumulative_counts;
+  };
+  std::optional<Histogram> histogram;
+};
+
+struct MetricFamily {
+  std::string name;  ///< with its unit
+  std::string help;
+  std::vector<Metric> metrics;
 };
 
 /// A fleet to learn from: one trajectory per system, no NaN.
@@ -271,7 +352,8 @@ struct EstimationOptions {
   Projection projection = Projection::kDefault;
   bool stay_diverged = false;   ///< do not begin anew after a divergence
   size_t max_in_flight = 8192;  ///< samples that may wait for their answer
-  size_t max_kept = 65536;      ///< answered samples kept for Resume
+  size_t max_kept = 65536;      ///< samples kept to be sent again
+  double reconnect_for_s = 60;  ///< how long a stream that was lost is tried to be opened again; 0: not at all
 };
 
 struct SessionInfo {
@@ -346,9 +428,17 @@ struct Smoothed {
   std::vector<EstimateBatch> batches;  ///< in order, all samples
 };
 
+/// How a connection is encrypted; texts in PEM form.
+struct Tls {
+  std::string authorities;       ///< of which one has signed the server's certificate; empty: the system's
+  std::string certificate, key;  ///< the client's own, with its chain, for a server that asks; else empty
+};
+
 struct Options {
   std::string server = "127.0.0.1:50051";  ///< HOST:PORT
   double timeout_s = 20;                   ///< of calls that ask one thing and get one answer
+  std::string token{};                     ///< bearer token; empty: none is shown. Beyond this machine it wants `tls`
+  std::optional<Tls> tls{};                ///< nothing: not encrypted
 };
 
 class EstimationSession;
@@ -423,6 +513,18 @@ class Client {
   Result<std::unique_ptr<EstimationSession>> ResumeEstimation(const std::string& session,
                                                               const std::string& token);
 
+  /// Looking after the server: these need a token of scope kAdmin where tokens are needed at all.
+  /// All that the server keeps, as it stands now; streams and jobs go on meanwhile.
+  Status CreateBackup(BackupSink& sink);
+  /// What the server counts and measures, as Prometheus reads it.
+  Result<std::vector<MetricFamily>> GetMetrics();
+  Result<NewToken> CreateToken(const TokenRequest& request);
+  /// Expired and revoked ones too, the oldest first.
+  Result<std::vector<Token>> ListTokens();
+  Result<Token> RevokeToken(const std::string& id);
+  /// The newest first. @param most  entries. @param tenant  whose; empty: everyone's.
+  Result<std::vector<AuditEntry>> ListAuditEntries(const std::string& tenant, size_t most);
+
  private:
   friend class EstimationSession;
   struct Impl;
@@ -433,38 +535,43 @@ class Client {
 /// receives.
 ///
 /// Samples are numbered from 1. They are kept until the server says that they will survive a crash
-/// (durable_seq), so that Resume can send them again; of a server that makes none durable the
-/// latest EstimationOptions::max_kept.
+/// (durable_seq), so that they can be sent again; of a server that makes none durable the latest
+/// EstimationOptions::max_kept.
+///
+/// A stream that is lost, with its connection or its server, is opened again and goes on: what is not durable and what
+/// was sent meanwhile is sent by itself, no estimate is missed and none comes twice. Only what does not pass within
+/// EstimationOptions::reconnect_for_s is told as an error.
 class EstimationSession {
  public:
   /// Ends the stream; the session stays on the server.
   ~EstimationSession();
 
-  /// As of the last time the stream was opened.
+  /// As of the time the session was opened, or Resume.
   const SessionInfo& info() const;
   /// Samples up to this number survive a crash of the server.
   uint64_t durable_seq() const;
 
   /// Sends samples and gives the number of the last. Blocks while max_in_flight samples wait for an
   /// answer: call Receive in another thread, or at least as often.
-  /// Errors: InvalidArgument for sizes that do not fit; Unavailable once the stream has ended
-  /// (Receive says why).
+  /// Errors: InvalidArgument for sizes that do not fit and what is no number: nothing is sent then;
+  /// Unavailable once the stream has ended (Receive says why).
   Result<uint64_t> Send(const SampleBatch& samples);
   /// Asks what the next `horizon` samples will be like; the answer comes by Receive, after those to
-  /// what has been sent before. Lost with the stream: ask again after Resume.
+  /// what has been sent before.
   /// @param inputs  horizon × n_u; empty: the last input goes on.
   Status AskForecast(size_t horizon, const std::vector<double>& inputs = {});
   /// Says that nothing more will be sent.
   void FinishSending();
 
-  /// The next estimates, waiting for them; nothing when all have come after FinishSending. On an
-  /// error everything up to the last estimate received stands, see Resume.
+  /// The next estimates, waiting for them; nothing when all have come after FinishSending. After an
+  /// error everything up to the last estimate received stands; its metadata say the durable_seq.
+  /// Errors: what made the stream end, where that does not pass in time; InvalidArgument for samples that the server
+  /// refuses: these and all sent after them are forgotten, and their numbers are given anew after Resume; Aborted if
+  /// another stream took the session over; DataLoss if the server needs samples that are no longer kept.
   Result<std::optional<EstimateBatch>> Receive();
 
-  /// After Receive gave an error (and no Send runs): opens the stream again and sends what is not
-  /// durable again. Estimates of those samples come again, bit for bit.
-  /// Errors: as opening; Aborted if another stream took the session over; DataLoss if the server
-  /// needs samples that are no longer kept.
+  /// After Receive gave an error (and no Send runs): tries once more, and sends what is not durable
+  /// again. Estimates of those samples come again, bit for bit. Errors: as Receive.
   Status Resume();
 
  private:

@@ -135,10 +135,19 @@ TEST_F(EstimateTest, MistakesInTheFileAreFoundBeforeASessionIsOpened) {
 
 TEST_F(EstimateTest, AServerThatStopsIsAFailureAfterWhatCame) {
   server_.estimation.stop_after_batches = 1;
-  const Outcome outcome = Run({}, "u1,y1\n0,1\n0,2\n0,3\n");
+  const Outcome outcome = Run({"--reconnect-for-s", "0"}, "u1,y1\n0,1\n0,2\n0,3\n");
   EXPECT_EQ(outcome.status, 1);
   EXPECT_EQ(outcome.out, std::string(kHeader) + "0,1,0.5,1.5,consistent,\n");
   EXPECT_THAT(outcome.err, HasSubstr("the server stops"));
+}
+
+TEST_F(EstimateTest, AServerThatComesBackIsGoneOnWith) {
+  server_.estimation.stop_after_batches = 2;
+  const Outcome outcome = Run({}, "u1,y1\n0,1\n0,2\n0,3\n");
+  EXPECT_EQ(outcome.status, 0) << outcome.err;
+  EXPECT_EQ(outcome.out, std::string(kHeader) +
+                             "0,1,0.5,1.5,consistent,\n0.5,2,0.5,1.5,consistent,\n1,3,0.5,1.5,consistent,\n");
+  EXPECT_EQ(server_.estimation.epoch, 2U);
 }
 
 }  // namespace

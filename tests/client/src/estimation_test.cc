@@ -102,7 +102,7 @@ TEST_F(EstimationTest, AnUnknownTargetIsTheErrorOfOpening) {
 TEST_F(EstimationTest, ResumingSendsAgainWhatIsNotDurable) {
   server_.estimation.make_durable = true;
   server_.estimation.stop_after_batches = 3;
-  const auto session = Open();
+  const auto session = Open({.reconnect_for_s = 0});
   for (const double y : {10, 20, 30}) {
     ASSERT_TRUE(session->Send(Batch({y, y + 1})).ok());
     ASSERT_TRUE(session->Receive().ok());
@@ -128,7 +128,7 @@ TEST_F(EstimationTest, ResumingSendsAgainWhatIsNotDurable) {
 TEST_F(EstimationTest, ResumingWithoutTheSamplesNeededIsAnError) {
   // Nothing is durable and two samples are kept, so that samples 1 and 2 are gone.
   server_.estimation.stop_after_batches = 4;
-  const auto session = Open({.max_kept = 2});
+  const auto session = Open({.max_kept = 2, .reconnect_for_s = 0});
   for (const double y : {1, 2, 3, 4}) {
     ASSERT_TRUE(session->Send(Batch({y})).ok());
     ASSERT_TRUE(session->Receive().ok());
@@ -150,10 +150,81 @@ TEST_F(EstimationTest, AnotherProcessResumesWithTheToken) {
 }
 
 TEST_F(EstimationTest, TheStreamEndsWithTheServer) {
-  const auto session = Open();
+  const auto session = Open({.reconnect_for_s = 0});
   server_.Stop();
   EXPECT_EQ(session->Receive().status().code, Code::kUnavailable);
   EXPECT_EQ(session->Receive().status().code, Code::kUnavailable);
+}
+
+TEST_F(EstimationTest, ALostStreamGoesOnByItself) {
+  server_.estimation.make_durable = true;
+  server_.estimation.stop_after_batches = 3;
+  const auto session = Open();
+  for (uint64_t i = 1; i <= 6; ++i) {
+    EXPECT_EQ(*session->Send(Batch({10.0 * i, 10.0 * i + 1})), 2 * i);
+    const auto batch = session->Receive();
+    ASSERT_TRUE(batch.ok()) << batch.status().message;
+    EXPECT_EQ((*batch)->first_seq, 2 * i - 1);
+    EXPECT_THAT((*batch)->means, ElementsAre(10.0 * i, 10.0 * i + 1));
+  }
+  EXPECT_EQ(server_.estimation.epoch, 2U);
+  // The server had answered the third, but not made it durable: it came again.
+  EXPECT_EQ(server_.estimation.batches.size(), 7U);
+}
+
+TEST_F(EstimationTest, HoweverOftenItIsLostNoEstimateIsMissedAndNoneComesTwice) {
+  server_.estimation.make_durable = true;
+  server_.estimation.stop_after_batches = server_.estimation.then_stop_after_batches = 7;
+  const auto session = Open({.max_in_flight = 10});
+  constexpr uint64_t kSamples = 120;
+  std::thread sender([&] {
+    for (uint64_t i = 1; i <= kSamples; ++i) EXPECT_TRUE(session->Send(Batch({1.0 * i})).ok());
+    session->FinishSending();
+  });
+  uint64_t received = 0;
+  while (true) {
+    const auto batch = session->Receive();
+    ASSERT_TRUE(batch.ok()) << batch.status().message;
+    if (!*batch) break;
+    for (size_t i = 0; i < (*batch)->samples; ++i) EXPECT_EQ((*batch)->means[i], (*batch)->first_seq + i);
+    EXPECT_EQ((*batch)->first_seq, received + 1);
+    received += (*batch)->samples;
+  }
+  sender.join();
+  EXPECT_EQ(received, kSamples);
+  EXPECT_GT(server_.estimation.epoch, kSamples / 7);
+}
+
+TEST_F(EstimationTest, AForecastThatWasNotAnsweredIsAskedForAgain) {
+  server_.estimation.stop_after_batches = 1;
+  const auto session = Open();
+  ASSERT_TRUE(session->Send(Batch({5})).ok());
+  ASSERT_TRUE(session->AskForecast(2).ok());
+  const auto estimate = session->Receive(), forecast = session->Receive();
+  ASSERT_TRUE(estimate.ok() && forecast.ok()) << forecast.status().message;
+  EXPECT_TRUE((*forecast)->forecast);
+  EXPECT_THAT((*forecast)->means, ElementsAre(5, 5));
+}
+
+TEST_F(EstimationTest, GivingUpSaysWhatTheServerHas) {
+  server_.estimation.durable_seq = 3;
+  const auto session = Open({.reconnect_for_s = 0.5});
+  server_.Stop();
+  const Status status = session->Receive().status();
+  EXPECT_EQ(status.code, Code::kUnavailable);
+  EXPECT_THAT(status.message, HasSubstr("gave up"));
+  EXPECT_EQ(status.metadata.at("durable_seq"), "3");
+  EXPECT_FALSE(session->Send(Batch({1})).ok());
+}
+
+TEST_F(EstimationTest, WhatDoesNotPassIsToldAtOnce) {
+  server_.estimation.stop_after_batches = 1;
+  const auto session = client_.ResumeEstimation("5", "secret");
+  ASSERT_TRUE(session.ok());
+  ASSERT_TRUE((*session)->Send(Batch({1})).ok());
+  ASSERT_TRUE((*session)->Receive().ok());
+  server_.estimation.secret = "another";
+  EXPECT_EQ((*session)->Receive().status().code, Code::kNotFound);
 }
 
 }  // namespace

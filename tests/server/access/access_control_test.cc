@@ -19,7 +19,7 @@ class AccessControlTest : public store::StoreTest {
     return made;
   }
   AccessControl& access() {
-    if (!access_) access_.emplace(*store_, [this] { return now_; }, true);
+    if (!access_) access_.emplace(*store_, [this] { return now_; }, security_);
     return *access_;
   }
   absl::StatusOr<Caller> Admit(const std::string& authorization, Scope needed = Scope::kRead) {
@@ -30,11 +30,12 @@ class AccessControlTest : public store::StoreTest {
     EXPECT_THAT(std::string(status.message()), HasSubstr(reason));
   }
 
+  ServerOptions::Security security_{.require_tokens = true};
   std::optional<AccessControl> access_;
 };
 
 TEST_F(AccessControlTest, WithoutTokensEveryoneIsTheMachinesOwner) {
-  AccessControl open(*store_, [this] { return now_; }, false);
+  AccessControl open(*store_, [this] { return now_; }, {});
   const Caller caller = open.Admit({}, Scope::kAdmin).value();
   EXPECT_EQ(caller.tenant, store::kDefaultTenant);
   EXPECT_EQ(caller.identity, "local");
@@ -78,8 +79,58 @@ TEST_F(AccessControlTest, EachScopeReachesAsFarAsItSays) {
       EXPECT_EQ(caller.ok(), needed <= scope) << store::ScopeName(scope);
       if (caller.ok()) continue;
       ExpectRefused(caller.status(), absl::StatusCode::kPermissionDenied,
-                    absl::StrCat("needs a token of scope ", store::ScopeName(needed)));
+                    absl::StrCat("needs scope ", store::ScopeName(needed)));
     }
+  }
+}
+
+class CertificateTest : public AccessControlTest {
+ protected:
+  CertificateTest() {
+    security_ = {.client_ca_file = "clients.pem",
+                 .clients = {{"press-7", "plant", Scope::kStream}, {"ops", "plant", Scope::kAdmin}}};
+  }
+};
+
+TEST_F(CertificateTest, AListedNameSaysWhoCalls) {
+  const Caller caller = access().Admit({.certificate_names = {"other", "press-7"}}, Scope::kStream).value();
+  EXPECT_EQ(caller.tenant, "plant");
+  EXPECT_EQ(caller.identity, "certificate press-7");
+  ExpectRefused(access().Admit({.certificate_names = {"press-7"}}, Scope::kWrite).status(),
+                absl::StatusCode::kPermissionDenied, "certificate press-7 has scope stream");
+}
+
+TEST_F(CertificateTest, NoOtherNameDoes) {
+  for (const std::vector<std::string>& names : std::vector<std::vector<std::string>>{{}, {"press-70"}, {""}}) {
+    ExpectRefused(access().Admit({.certificate_names = names}, Scope::kRead).status(),
+                  absl::StatusCode::kUnauthenticated, "security.clients");
+  }
+}
+
+TEST_F(CertificateTest, ATokenGoesBeforeTheCertificate) {
+  const store::NewToken made = Make(Scope::kRead);
+  Credentials both{.authorization = "Bearer " + made.secret, .certificate_names = {"ops"}};
+  EXPECT_EQ(access().Admit(both, Scope::kRead)->identity, "token t1");
+  EXPECT_FALSE(access().Admit(both, Scope::kAdmin).ok());
+  both.authorization = "Bearer wrong";
+  ExpectRefused(access().Admit(both, Scope::kRead).status(), absl::StatusCode::kUnauthenticated, "not known");
+}
+
+TEST_F(CertificateTest, WhereTokensAreRequiredACertificateAloneIsNotEnough) {
+  security_.require_tokens = true;
+  ExpectRefused(access().Admit({.certificate_names = {"ops"}}, Scope::kRead).status(),
+                absl::StatusCode::kUnauthenticated, "wants a token");
+}
+
+TEST_F(AccessControlTest, CallsThatDoNotComeThroughANamedProxyAreRefused) {
+  security_.proxies = {"10.0.0.5", "2001:DB8:0::5"};
+  const std::string authorization = "Bearer " + Make(Scope::kAdmin).secret;
+  for (const char* peer : {"10.0.0.5", "2001:db8::5"}) {
+    EXPECT_TRUE(access().Admit({.authorization = authorization, .peer_host = peer}, Scope::kRead).ok()) << peer;
+  }
+  for (const char* peer : {"10.0.0.6", "2001:db8::6", "127.0.0.1", ""}) {
+    ExpectRefused(access().Admit({.authorization = authorization, .peer_host = peer}, Scope::kRead).status(),
+                  absl::StatusCode::kPermissionDenied, "proxies");
   }
 }
 

@@ -54,10 +54,12 @@ const std::map<std::string, v1::Scope>& Needed() {
       {"EstimationService.ListSessions", v1::READ},
       {"EstimationService.DeleteSession", v1::STREAM},
       {"ServerService.GetServerInfo", v1::READ},
+      {"ServerService.GetMetrics", v1::ADMIN},
       {"AdminService.CreateToken", v1::ADMIN},
       {"AdminService.ListTokens", v1::ADMIN},
       {"AdminService.RevokeToken", v1::ADMIN},
       {"AdminService.ListAuditEntries", v1::ADMIN},
+      {"AdminService.CreateBackup", v1::ADMIN},
   };
   return needed;
 }
@@ -176,7 +178,7 @@ class MatrixTest : public ServerTest {
   void SetUp() override {
     ServerTest::SetUp();
     const auto admin = CreateFirstToken();
-    options_.require_tokens = true;
+    options_.security.require_tokens = true;
     Stop();
     Start();
     caller_.emplace(server_->address());

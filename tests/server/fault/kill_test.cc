@@ -1,7 +1,13 @@
 // kill -9 of the server at seeded moments of training, adaptation and upload: it starts again,
 // every model listed loads, nothing half made is listed, and the job goes on. A moment is a number of changes in the data
 // directory: kills hit where something is being written, and a slow machine gets as far as a quick one.
+//
+// METAEKF_FAULTS=long: 200 kills of jobs instead of 20.
 
+#include <sys/types.h>
+
+#include <csignal>
+#include <filesystem>
 #include <functional>
 #include <thread>
 
@@ -10,6 +16,7 @@
 #include "tests/server/support/server_process.h"
 #include "tests/server/support/server_test.h"
 #include "tests/server/support/tiny_models.h"
+#include "tests/support/faults.h"
 
 namespace metaekf::server {
 namespace {
@@ -21,7 +28,7 @@ constexpr int kRounds = 20;
 // Changes within which a kill comes: several uploads, adaptations or checkpoints.
 constexpr uint64_t kUploadChanges = 60, kAdaptationChanges = 80, kTrainingChanges = 30;
 
-class KillTest : public testing::Test {
+class KillTest : public ::testing::Test {
  protected:
   /// Starts a server, repeats `piece` against it, and kills it after so many changes; returns how many pieces were confirmed.
   int KillAfter(size_t changes, const std::function<bool(Client&)>& piece) {
@@ -88,7 +95,7 @@ class KillTest : public testing::Test {
 
   void SetUp() override {
     config_ = directory_.path() + "/../" +
-              testing::UnitTest::GetInstance()->current_test_info()->name() + ".textproto";
+              ::testing::UnitTest::GetInstance()->current_test_info()->name() + ".textproto";
     std::ofstream(config_) << "training { threads_per_job: 1 checkpoint_period_s: 0.02 }";
   }
   void TearDown() override { std::remove(config_.c_str()); }
@@ -97,30 +104,70 @@ class KillTest : public testing::Test {
   std::string config_;
 };
 
-TEST_F(KillTest, TrainingGoesOnAfterEachOfTwentyKills) {
-  WithServer([](Client& client) { ASSERT_TRUE(client.CreateJob(TinyJob("robot", 100'000'000)).ok()); });
+/// The one worker of a server; 0 if there is none.
+pid_t FindWorker(pid_t server) {
+  std::error_code gone;
+  for (const auto& entry : std::filesystem::directory_iterator(absl::StrCat("/proc/", server, "/task"), gone)) {
+    std::ifstream children(entry.path() / "children");
+    pid_t child = 0;
+    if (children >> child) return child;
+  }
+  return 0;
+}
+
+// Server and worker in turn, at any moment of jobs that follow each other.
+TEST_F(KillTest, EachJobPublishesOneVersionWithTheBitsOfAnUndisturbedOne) {
+  const int kills = metaekf::testing::LongFaults() ? 200 : kRounds;
+  constexpr uint32_t kIterations = 1500;
+  std::string undisturbed;
+  WithServer([&](Client& client) {
+    ASSERT_TRUE(client.CreateJob(TinyJob("undisturbed", kIterations)).ok());
+    ASSERT_EQ(client.Watch("jobs/1").value.back().state(), v1::Job::SUCCEEDED);
+    undisturbed = client.Call(Named<v1::GetModelVersionRequest>("models/undisturbed")).value.sha256();
+  });
   base::Rng rng(2025);
-  for (int round = 0; round < kRounds && !HasFailure(); ++round) {
-    SCOPED_TRACE(round);
+  int jobs = 0;
+  for (int kill = 0; kill < kills && !HasFailure();) {
+    SCOPED_TRACE(kill);
     ServerProcess server = ServerProcess::Metaekfd(directory_.path(), config_);
     ASSERT_NE(server.address(), "") << "the server did not start";
     Client client(server.address());
     CheckEverything(client);
-    EXPECT_TRUE(DirectoryChanges(directory_.path()).Wait(1 + rng.Index(kTrainingChanges)));
+    const v1::Job latest = client.Call(v1::ListJobsRequest()).value.jobs(0);
+    if (latest.state() != v1::Job::RUNNING && latest.state() != v1::Job::QUEUED) {
+      ASSERT_EQ(latest.state(), v1::Job::SUCCEEDED) << latest.error_message();
+      ASSERT_TRUE(client.CreateJob(TinyJob(absl::StrCat("robot", ++jobs), kIterations)).ok());
+    }
+    // Or less, if the job comes to its end before: there is nothing more to see then.
+    (void)DirectoryChanges(directory_.path()).Wait(1 + rng.Index(kTrainingChanges), absl::Milliseconds(500));
+    const pid_t worker = FindWorker(server.pid());
+    if (kill % 2 == 1 && worker > 0) {
+      // Then there is one checkpoint at least before the next: a job that gets nowhere is given up, rightly.
+      ::kill(worker, SIGKILL);
+      const std::string checkpoint = absl::StrCat(directory_.path(), "/jobs/default-", jobs + 1, "/checkpoint");
+      std::error_code none;
+      const auto before = std::filesystem::last_write_time(checkpoint, none);
+      const auto goes_on = [&] {
+        std::error_code error;
+        return std::filesystem::last_write_time(checkpoint, error) > before ||
+               client.Call(Named<v1::GetJobRequest>(absl::StrCat("jobs/", jobs + 1))).value.state() != v1::Job::RUNNING;
+      };
+      while (!goes_on()) std::this_thread::yield();
+      ++kill;
+    }
     EXPECT_EQ(server.End(SIGKILL).signal, SIGKILL);
+    ++kill;
   }
-  // It is still the first job, further on than any server left it in the meantime.
-  ServerProcess server = ServerProcess::Metaekfd(directory_.path(), config_);
-  Client client(server.address());
-  const auto jobs = client.Call(v1::ListJobsRequest());
-  ASSERT_THAT(jobs.value.jobs(), SizeIs(1));
-  const uint32_t reached = jobs.value.jobs(0).progress().iteration();
-  const auto watched = client.Watch("jobs/1", [&](const v1::WatchJobResponse& response) {
-    return response.progress().iteration() <= reached || response.state() != v1::Job::RUNNING;
+  ASSERT_GT(jobs, 0);
+  WithServer([&](Client& client) {
+    for (int job = 1; job <= jobs; ++job) {
+      const std::string model = absl::StrCat("models/robot", job);
+      const v1::WatchJobResponse last = client.Watch(absl::StrCat("jobs/", job + 1)).value.back();
+      EXPECT_EQ(last.state(), v1::Job::SUCCEEDED) << last.error_message();
+      EXPECT_EQ(client.Call(Named<v1::GetModelRequest>(model)).value.version_count(), 1u);
+      EXPECT_EQ(client.Call(Named<v1::GetModelVersionRequest>(model)).value.sha256(), undisturbed);
+    }
   });
-  EXPECT_EQ(watched.value.back().state(), v1::Job::RUNNING) << watched.value.back().error_message();
-  EXPECT_GT(watched.value.back().progress().iteration(), reached);
-  EXPECT_EQ(server.End(SIGTERM).code, 0);
 }
 
 TEST_F(KillTest, NothingHalfMadeIsListedAfterKillsDuringUploads) {

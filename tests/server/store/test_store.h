@@ -17,7 +17,7 @@ namespace metaekf::store {
 /// A directory that goes with the test.
 class TempDirectory {
  public:
-  TempDirectory() : path_(testing::TempDir() + "/metaekf-store-XXXXXX") {
+  TempDirectory() : path_(::testing::TempDir() + "/metaekf-store-XXXXXX") {
     if (mkdtemp(path_.data()) == nullptr) ADD_FAILURE() << "cannot make " << path_;
   }
   ~TempDirectory() {
@@ -50,7 +50,7 @@ class FileSizeLimit {
 };
 
 /// An open store in a directory of its own, at a time that stands until it is moved.
-class StoreTest : public testing::Test {
+class StoreTest : public ::testing::Test {
  protected:
   void SetUp() override { Reopen(); }
 

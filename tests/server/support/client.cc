@@ -190,9 +190,11 @@ Reply<std::vector<v1::SmoothResponse>> Client::Smooth(const std::vector<v1::Smoo
       requests, [this](auto* context) { return stubs_->smoothing->Smooth(context); }, {});
 }
 
-std::string Client::Health() {
+std::string Client::Health(const std::string& service) {
+  grpc::health::v1::HealthCheckRequest request;
+  request.set_service(service);
   const auto reply = Unary<grpc::health::v1::HealthCheckResponse>(
-      grpc::health::v1::HealthCheckRequest(),
+      request,
       [this](auto... arguments) { return stubs_->health->Check(arguments...); });
   if (!reply.ok()) return absl::StatusCodeToString(reply.code);
   return grpc::health::v1::HealthCheckResponse::ServingStatus_Name(reply.value.status());

@@ -80,7 +80,7 @@ class Client {
   Reply<v1::ServerInfo> Call(const v1::GetServerInfoRequest& request);
 
   /// grpc.health.v1: "SERVING", "NOT_SERVING", or the name of the error's code.
-  std::string Health();
+  std::string Health(const std::string& service = "");
   /// The bytes with which reflection answers to a request for the list of services.
   std::string ReflectedServices();
 

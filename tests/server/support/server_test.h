@@ -39,7 +39,7 @@ Request Named(const std::string& name) {
 }
 
 /// A server in this process, with a data directory of its own, and a client of it.
-class ServerTest : public testing::Test {
+class ServerTest : public ::testing::Test {
  protected:
   void SetUp() override {
     options_.data_directory = directory_.path();
