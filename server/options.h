@@ -49,7 +49,7 @@ struct ServerOptions {
   } training;
 
   struct Limits {
-    int64_t memory_bytes = 0;  ///< of gRPC's buffers; 0: a quarter of the machine's memory
+    int64_t memory_bytes = int64_t{64} << 20;  ///< of gRPC's buffers
     int64_t message_bytes = int64_t{4} << 20;
     int64_t metadata_bytes = int64_t{16} << 10;
     int64_t streams_per_connection = 1024;

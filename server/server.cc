@@ -6,7 +6,6 @@
 #include <grpcpp/impl/service_type.h>
 #include <grpcpp/resource_quota.h>
 #include <spdlog/spdlog.h>
-#include <unistd.h>
 
 #include <algorithm>
 #include <chrono>
@@ -29,12 +28,6 @@
 namespace metaekf::server {
 namespace {
 
-size_t MemoryQuota(int64_t configured) {
-  if (configured > 0) return static_cast<size_t>(configured);
-  return static_cast<size_t>(sysconf(_SC_PHYS_PAGES)) / 4 *
-         static_cast<size_t>(sysconf(_SC_PAGESIZE));
-}
-
 size_t ComputeThreads(size_t configured) {
   return configured > 0 ? configured : std::max(1U, std::thread::hardware_concurrency() / 2);
 }
@@ -45,7 +38,7 @@ constexpr absl::Duration kFarewell = absl::Milliseconds(500);
 void SetLimits(const ServerOptions::Limits& limits, grpc::ServerBuilder& builder) {
   builder.SetMaxReceiveMessageSize(static_cast<int>(limits.message_bytes));
   builder.SetResourceQuota(
-      grpc::ResourceQuota("metaekfd").Resize(MemoryQuota(limits.memory_bytes)));
+      grpc::ResourceQuota("metaekfd").Resize(static_cast<size_t>(limits.memory_bytes)));
   // A small compressed message could become a very large one.
   builder.SetCompressionAlgorithmSupportStatus(GRPC_COMPRESS_GZIP, false);
   builder.SetCompressionAlgorithmSupportStatus(GRPC_COMPRESS_DEFLATE, false);
@@ -112,9 +105,11 @@ class Server::Parts {
     grpc::reflection::InitProtoReflectionServerBuilderPlugin();
     grpc::ServerBuilder builder;
     SetLimits(options.limits, builder);
-    // A connection keeps the certificates that it began with. Its streams may take as long as they like.
-    builder.AddChannelArgument(GRPC_ARG_MAX_CONNECTION_AGE_MS,
-                               static_cast<int>(absl::ToInt64Milliseconds(options.security.max_connection_age)));
+    if (!options.security.certificate_file.empty()) {
+      // A connection keeps the certificates that it began with. Its streams may take as long as they like.
+      builder.AddChannelArgument(GRPC_ARG_MAX_CONNECTION_AGE_MS,
+                                 static_cast<int>(absl::ToInt64Milliseconds(options.security.max_connection_age)));
+    }
     host = address.host;
     builder.AddListeningPort(options.listen, credentials, &port);
     for (const auto& service : services) builder.RegisterService(service.get());

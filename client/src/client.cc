@@ -45,8 +45,11 @@ Client::Impl::Impl(const Options& client_options)
 
 Status Client::Impl::Translate(const grpc::Status& status) const {
   Status result = FromGrpc(status);
-  // gRPC cancels calls that reach a server while it ends.
-  if (result.code == Code::kCancelled && status.error_details().empty()) result.code = Code::kUnavailable;
+  if (status.error_details().empty()) {
+    // gRPC cancels calls that reach a server while it ends, and some where its buffers are full.
+    const bool reset = result.message.find("RST_STREAM") != std::string::npos;
+    if (result.code == Code::kCancelled || (result.code == Code::kResourceExhausted && reset)) result.code = Code::kUnavailable;
+  }
   if (result.code == Code::kUnavailable && status.error_details().empty()) {
     // Errors of gRPC itself, not of the server.
     const bool unresolved = result.message.find("resolution failed") != std::string::npos;

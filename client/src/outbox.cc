@@ -8,6 +8,7 @@ namespace metaekf::client {
 
 Outbox::Entry Outbox::Add(v1::SampleBatch batch, size_t samples) {
   batch.set_first_seq(sent_seq_ + 1);
+  batch.set_received_seq(answered_seq_);
   sent_seq_ += samples;
   const auto request = std::make_shared<v1::EstimateRequest>();
   *request->mutable_samples() = std::move(batch);

@@ -162,8 +162,8 @@ absl::Status ApplyConfig(const std::string& text, ServerOptions* options) {
 
   const v1::ServerConfig::Limits& given = config.limits();
   ServerOptions::Limits& limits = options->limits;
-  constexpr uint64_t kKilo = 1024;
-  taker.Count("limits.memory_bytes", given.has_memory_bytes(), given.memory_bytes(), 0,
+  constexpr uint64_t kKilo = 1024, kLeastMemory = 8 << 20;
+  taker.Count("limits.memory_bytes", given.has_memory_bytes(), given.memory_bytes(), kLeastMemory,
               &limits.memory_bytes);
   taker.Count("limits.message_bytes", given.has_message_bytes(), given.message_bytes(), kKilo,
               &limits.message_bytes);

@@ -20,7 +20,11 @@ absl::Status TakenOver() {
   return WithReason(absl::AbortedError("another stream has resumed the session, or it was deleted"), "SESSION_TAKEN_OVER", {});
 }
 
-void CompleteAnswer(const LiveSession& live, v1::EstimateBatch* estimates) {
+void CompleteAnswer(const v1::SampleBatch& batch, LiveSession& live, v1::EstimateBatch* estimates) {
+  if (batch.has_received_seq()) {
+    const uint64_t told = std::min(batch.received_seq(), live.session->applied_seq());
+    live.received_seq = std::max(live.received_seq.value_or(live.durable_seq), told);
+  }
   estimates->set_durable_seq(live.durable_seq);
   if (estimates->nis().empty()) estimates->set_first_seq(live.session->applied_seq());
 }
@@ -34,7 +38,7 @@ struct BatchQueue::Lane {
   }
   Session& session() const { return *batch.live->session; }
   void End(const absl::Status& status) {
-    CompleteAnswer(*batch.live, batch.estimates);
+    CompleteAnswer(*batch.samples, *batch.live, batch.estimates);
     lock.unlock();
     batch.done(status, cost);
   }

@@ -5,7 +5,9 @@
 #include <functional>
 #include <memory>
 #include <mutex>
+#include <optional>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "absl/status/status.h"
@@ -26,6 +28,10 @@ struct LiveSession {
   std::mutex mutex;
   std::unique_ptr<Session> session;
   uint64_t durable_seq = 0;
+  std::optional<uint64_t> received_seq;  ///< whose estimates have arrived, of clients that tell
+  /// Of clients that tell: the session after samples whose estimates may not have arrived, the oldest first. Durable is what
+  /// has: a client that was cut off goes on where it is, not where the server is.
+  std::deque<std::pair<uint64_t, std::string>> waiting;
   bool taken_over = false;  ///< another stream has claimed the session
 };
 
@@ -84,7 +90,7 @@ class BatchQueue {
 /// That another stream has the session now.
 absl::Status TakenOver();
 
-/// Completes the answer to a batch with what the session knows; its mutex is held.
-void CompleteAnswer(const LiveSession& live, v1::EstimateBatch* estimates);
+/// Completes the answer to a batch with what the session knows, and notes what the batch tells; the session's mutex is held.
+void CompleteAnswer(const v1::SampleBatch& batch, LiveSession& live, v1::EstimateBatch* estimates);
 
 }  // namespace metaekf::server

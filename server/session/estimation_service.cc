@@ -24,6 +24,8 @@ constexpr std::chrono::milliseconds kSweepPeriod(500);
 // Longer batches go to threads of their own. To wake one costs as much as 64 samples of a small model.
 constexpr std::chrono::microseconds kLongReaction(200);
 
+constexpr int kManyRows = 128;  // in a batch, whose memory is not kept for the next
+
 absl::Status Draining(uint64_t durable_seq) {
   return WithReason(
       absl::UnavailableError(absl::StrCat("the server stops; resume after sample ", durable_seq, " when it is back")),
@@ -63,6 +65,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   void OnWriteDone(bool ok) override {
     std::lock_guard lock(mutex_);
     writing_ = false;
+    if (response_.estimates().nis_size() > kManyRows) ForgetLargeMessages();
     if (!ok) End(absl::CancelledError("the client has gone"));
     Advance();
   }
@@ -76,7 +79,9 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   void OnDone() override {
     // Whoever called Finish may still hold the mutex on another thread: it must have let go before this is deleted.
     { std::lock_guard lock(mutex_); }
-    if (live_ != nullptr) service_.sessions_.Close(live_);
+    // A lost connection looks like the end of the requests first.
+    const bool all_arrived = finish_with_ && finish_with_->ok() && !context_->IsCancelled();
+    if (live_ != nullptr) service_.sessions_.Close(live_, all_arrived);
     service_.Remove(this);
     delete this;
   }
@@ -211,6 +216,13 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
     Advance();
   }
 
+  /// Messages keep the memory that they once had. With mutex_ held, between a batch and the next.
+  void ForgetLargeMessages() {
+    response_ = v1::EstimateResponse();
+    work_ = v1::EstimateRequest();
+    if (!reading_ && !has_request_) request_ = v1::EstimateRequest();
+  }
+
   /// With mutex_ held, after each batch.
   void Count(const v1::EstimateBatch& estimates) {
     const steady_clock::time_point now = steady_clock::now();
@@ -281,7 +293,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
       } else {
         v1::EstimateBatch* estimates = response_.mutable_estimates();
         status = live_->session->Apply(work_.samples(), scratch.get(), estimates);
-        CompleteAnswer(*live_, estimates);
+        CompleteAnswer(work_.samples(), *live_, estimates);
         applied = estimates->nis_size() > 0;
       }
     }

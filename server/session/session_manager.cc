@@ -3,6 +3,7 @@
 #include <spdlog/spdlog.h>
 
 #include <chrono>
+#include <optional>
 
 #include "absl/time/clock.h"
 #include "core/base/status.h"
@@ -14,6 +15,23 @@ namespace metaekf::server {
 namespace {
 
 constexpr std::chrono::milliseconds kCommitPeriod(100);
+constexpr size_t kMostWaiting = 16;  // checkpoints of one session: of a client that tells late
+
+/// What of a session may become durable now: sample number and checkpoint; nothing if that is so already. With its mutex held.
+std::optional<std::pair<uint64_t, std::string>> NextDurable(LiveSession& live) {
+  const uint64_t applied = live.session->applied_seq();
+  if (!live.received_seq) return std::pair(applied, live.session->Checkpoint());
+  if (live.waiting.empty() || live.waiting.back().first < applied) {
+    if (live.waiting.size() == kMostWaiting) live.waiting.pop_back();
+    live.waiting.emplace_back(applied, live.session->Checkpoint());
+  }
+  std::optional<std::pair<uint64_t, std::string>> next;
+  while (!live.waiting.empty() && live.waiting.front().first <= *live.received_seq) {
+    next = std::move(live.waiting.front());
+    live.waiting.pop_front();
+  }
+  return next;
+}
 
 }  // namespace
 
@@ -110,7 +128,14 @@ void SessionManager::MarkDirty(const std::shared_ptr<LiveSession>& live) {
   dirty_.insert(live);
 }
 
-void SessionManager::Close(const std::shared_ptr<LiveSession>& live) {
+void SessionManager::Close(const std::shared_ptr<LiveSession>& live, bool all_arrived) {
+  if (all_arrived) {
+    {
+      std::lock_guard lock(live->mutex);
+      if (live->received_seq) live->received_seq = live->session->applied_seq();
+    }
+    MarkDirty(live);
+  }
   std::lock_guard lock(mutex_);
   const auto it = live_.find({live->tenant, live->number});
   if (it != live_.end() && it->second == live) live_.erase(it);
@@ -127,10 +152,18 @@ void SessionManager::Flush() {
   }
   if (sessions.empty()) return;
   std::vector<store::SessionCheckpoint> checkpoints;
-  for (const std::shared_ptr<LiveSession>& live : sessions) {
+  std::erase_if(sessions, [&](const std::shared_ptr<LiveSession>& live) {
     std::lock_guard lock(live->mutex);
-    checkpoints.push_back({live->tenant, live->number, static_cast<int64_t>(live->epoch),
-                           static_cast<int64_t>(live->session->applied_seq()), live->session->Checkpoint()});
+    std::optional<std::pair<uint64_t, std::string>> next = NextDurable(*live);
+    if (!next) return true;
+    checkpoints.push_back({live->tenant, live->number, static_cast<int64_t>(live->epoch), static_cast<int64_t>(next->first),
+                           std::move(next->second)});
+    return false;
+  });
+  if (sessions.empty()) {
+    std::lock_guard lock(mutex_);
+    flushed_since_ = absl::InfiniteFuture();
+    return;
   }
   const absl::Time start = absl::Now();
   const absl::StatusOr<std::vector<bool>> written = store_.SaveCheckpoints(checkpoints);
@@ -142,6 +175,11 @@ void SessionManager::Flush() {
   if (!written.ok()) {
     // Nothing became durable; clients keep their samples. The next commit tries again.
     spdlog::error("checkpoints of {} sessions not written: {}", sessions.size(), written.status().ToString());
+    for (size_t i = 0; i < sessions.size(); ++i) {
+      std::lock_guard lock(sessions[i]->mutex);
+      if (!sessions[i]->received_seq) continue;
+      sessions[i]->waiting.emplace_front(static_cast<uint64_t>(checkpoints[i].durable_seq), std::move(checkpoints[i].checkpoint));
+    }
     std::lock_guard lock(mutex_);
     dirty_.insert(sessions.begin(), sessions.end());
     return;

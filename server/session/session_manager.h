@@ -31,8 +31,9 @@ class SessionManager {
 
   /// Notes that samples were applied: they become durable with the next commit.
   void MarkDirty(const std::shared_ptr<LiveSession>& live);
-  /// The stream has ended; what it applied last is still written.
-  void Close(const std::shared_ptr<LiveSession>& live);
+  /// The stream has ended; what its client may go on behind is still written.
+  /// @param all_arrived  the client has ended it after all answers.
+  void Close(const std::shared_ptr<LiveSession>& live, bool all_arrived);
   /// Writes what is dirty now.
   void Flush();
 

@@ -145,11 +145,16 @@ TEST_F(NonsenseTest, TimesBeyondTheLagLeaveTheSessionAsItWas) {
   const client::Status status = session->Receive().status();
   EXPECT_EQ(status.code, client::Code::kInvalidArgument);
   EXPECT_THAT(status.message, HasSubstr("samples.times_s[0]"));
-  // Whoever has the token goes on with it.
-  const auto resumed = client.ResumeEstimation(session->info().session, session->info().token);
-  ASSERT_TRUE(resumed.ok()) << resumed.status().message;
-  EXPECT_EQ((*resumed)->info().durable_seq, 5u);
-  const client::EstimateBatch a = Answer(**resumed, at(0.5, 0.1)), b = Answer(*reference, at(0.5, 0.1));
+  const client::Status resumed = session->Resume();
+  ASSERT_TRUE(resumed.ok()) << resumed.message;
+  ASSERT_TRUE(session->Send(at(0.5, 0.1)).ok());
+  client::EstimateBatch a;
+  while (a.first_seq < 6) {  // what the server could not know to have arrived comes again first
+    const auto batch = session->Receive();
+    ASSERT_TRUE(batch.ok()) << batch.status().message;
+    a = **batch;
+  }
+  const client::EstimateBatch b = Answer(*reference, at(0.5, 0.1));
   EXPECT_EQ(a.means, b.means);
   EXPECT_EQ(a.covariances, b.covariances);
 }

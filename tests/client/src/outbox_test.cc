@@ -37,6 +37,12 @@ TEST_F(OutboxTest, NumbersGoOn) {
   EXPECT_EQ(resumed.Add(Samples(1), 1).last_seq, 9u);
 }
 
+TEST_F(OutboxTest, EachBatchTellsWhatHasArrived) {
+  EXPECT_EQ(outbox_.Add(Samples(3), 3).request->samples().received_seq(), 0u);
+  outbox_.Answered(2, 0, kAll);
+  EXPECT_EQ(outbox_.Add(Samples(3), 3).request->samples().received_seq(), 2u);
+}
+
 TEST_F(OutboxTest, WhatIsDurableIsForgotten) {
   for (int i = 0; i < 3; ++i) outbox_.Add(Samples(2), 2);
   outbox_.Answered(6, 0, kAll);

@@ -229,6 +229,36 @@ TEST_F(EstimationServiceTest, ARestartOfTheServerLosesNothing) {
   ExpectIdentical(estimates, Direct(recording));
 }
 
+TEST_F(EstimationServiceTest, AClientThatTellsWhatHasArrivedGoesOnBehindIt) {
+  const Recording recording = MakeRecording(20'000, 0);
+  Call call = Start(OpenRequest());
+  const v1::SessionOpened opened = ReadOpened(call);
+  Estimates estimates;
+  v1::EstimateResponse response;
+  constexpr uint64_t kLate = 10;  // samples whose estimates are on their way
+  uint64_t seq = 0;
+  while (response.estimates().durable_seq() == 0 && seq < recording.inputs.size()) {
+    v1::EstimateRequest request = Batch(recording, ++seq, 1);
+    request.mutable_samples()->set_received_seq(seq > kLate ? seq - kLate : 0);
+    call.stream->Write(request);
+    ASSERT_TRUE(call.stream->Read(&response));
+    Append(response.estimates(), &estimates);
+    if (response.estimates().durable_seq() > 0) {
+      EXPECT_LE(response.estimates().durable_seq() + kLate, seq);
+    }
+  }
+  ASSERT_GT(response.estimates().durable_seq(), 0u);
+  call.context->TryCancel();
+  call.stream->Finish();
+  Call again = Start(ResumeRequest(opened));
+  const uint64_t durable = ReadOpened(again).durable_seq();
+  EXPECT_LE(durable + kLate, seq);
+  // They come again, the same.
+  const Estimates rest = Run(again, recording, durable + 1, seq, 1);
+  const size_t per_sample = estimates.size() / seq;
+  ExpectIdentical(rest, Estimates(estimates.begin() + static_cast<ptrdiff_t>(durable * per_sample), estimates.end()));
+}
+
 TEST_F(EstimationServiceTest, ResumingTakesTheSessionFromItsOldStream) {
   const Recording recording = MakeRecording(20, 0);
   Call first = Start(OpenRequest());
