@@ -9,6 +9,7 @@
 #include "core/base/numbers.h"
 #include "core/base/status.h"
 #include "metaekf/v1/config.pb.h"
+#include "server/convert/scope.h"
 #include "server/store/files.h"
 #include "server/store/names.h"
 
@@ -60,26 +61,12 @@ class Taker {
   absl::Status status_;
 };
 
-absl::StatusOr<store::Scope> ToScope(v1::Scope scope) {
-  switch (scope) {
-    case v1::READ:
-      return store::Scope::kRead;
-    case v1::STREAM:
-      return store::Scope::kStream;
-    case v1::WRITE:
-      return store::Scope::kWrite;
-    case v1::ADMIN:
-      return store::Scope::kAdmin;
-    default:
-      return absl::InvalidArgumentError("scope must be READ, STREAM, WRITE or ADMIN");
-  }
-}
-
 absl::StatusOr<ServerOptions::Security::Client> ToClient(const v1::ServerConfig::Security::Client& given) {
   if (given.certificate_name().empty()) return absl::InvalidArgumentError("certificate_name is missing");
   METAEKF_RETURN_IF_ERROR(store::CheckName("tenant", given.tenant()));
-  METAEKF_ASSIGN_OR_RETURN(const store::Scope scope, ToScope(given.scope()));
-  return ServerOptions::Security::Client{given.certificate_name(), given.tenant(), scope};
+  const absl::StatusOr<store::Scope> scope = ToScope(given.scope());
+  if (!scope.ok()) return base::Annotate(scope.status(), "scope");
+  return ServerOptions::Security::Client{given.certificate_name(), given.tenant(), *scope};
 }
 
 void ApplySecurity(const v1::ServerConfig::Security& given, Taker& taker,

@@ -4,6 +4,7 @@
 #include "absl/strings/string_view.h"
 #include "absl/strings/strip.h"
 #include "core/base/status.h"
+#include "server/convert/scope.h"
 #include "server/convert/time.h"
 #include "server/handlers/page.h"
 #include "server/status/details.h"
@@ -15,26 +16,11 @@ namespace {
 constexpr size_t kMaxNoteBytes = 256;
 constexpr absl::string_view kPrefix = "tokens/";
 
-absl::StatusOr<store::Scope> ToScope(v1::Scope scope) {
-  switch (scope) {
-    case v1::READ:
-      return store::Scope::kRead;
-    case v1::STREAM:
-      return store::Scope::kStream;
-    case v1::WRITE:
-      return store::Scope::kWrite;
-    case v1::ADMIN:
-      return store::Scope::kAdmin;
-    default:
-      return FieldViolation("scope", "must be READ, STREAM, WRITE or ADMIN");
-  }
-}
-
 v1::Token ToMessage(const store::Token& token) {
   v1::Token message;
   message.set_name(absl::StrCat(kPrefix, token.id));
   message.set_tenant(token.tenant);
-  message.set_scope(static_cast<v1::Scope>(static_cast<int>(token.scope) + 1));
+  message.set_scope(server::ToMessage(token.scope));
   message.set_note(token.note);
   *message.mutable_create_time() = ToTimestamp(token.create_time);
   if (token.expire_time != absl::InfiniteFuture()) {
@@ -54,7 +40,8 @@ absl::Status CreateToken(CallContext& context, const v1::CreateTokenRequest& req
   if (const absl::Status named = store::CheckName("tenant", tenant); !named.ok()) {
     return FieldViolation("tenant", std::string(named.message()));
   }
-  METAEKF_ASSIGN_OR_RETURN(const store::Scope scope, ToScope(request.scope()));
+  const absl::StatusOr<store::Scope> scope = ToScope(request.scope());
+  if (!scope.ok()) return FieldViolation("scope", std::string(scope.status().message()));
   absl::Duration lifetime = absl::InfiniteDuration();
   if (request.has_lifetime()) {
     lifetime = absl::Seconds(request.lifetime().seconds()) +
@@ -67,7 +54,7 @@ absl::Status CreateToken(CallContext& context, const v1::CreateTokenRequest& req
   }
   METAEKF_ASSIGN_OR_RETURN(const store::NewToken made,
                            context.server.store.Tokens(context.caller.identity)
-                               .Create(tenant, scope, lifetime, request.note()));
+                               .Create(tenant, *scope, lifetime, request.note()));
   METAEKF_RETURN_IF_ERROR(context.server.access.Reload());
   *response->mutable_token() = ToMessage(made.token);
   response->set_secret(made.secret);

@@ -58,7 +58,8 @@ void Metrics::CountBatch(const StreamCounters& counters, absl::Span<const double
   if (gated > 0) counters.gated->Increment(static_cast<double>(gated));
   if (resets > 0) counters.resets->Increment(static_cast<double>(resets));
   estimate_seconds_.Observe(absl::ToDoubleSeconds(latency));
-  std::vector<double> counts(kNis.size() + 1, 0.0);
+  thread_local std::vector<double> counts;
+  counts.assign(kNis.size() + 1, 0.0);
   double sum = 0;
   for (const double value : nis) {
     if (std::isnan(value)) continue;

@@ -111,7 +111,7 @@ TEST(ReadConfigTest, ErrorsNameThePlace) {
   EXPECT_THAT(Error("security { clients { tenant: 'a' scope: READ } }"),
               HasSubstr("security.clients[0]: certificate_name is missing"));
   EXPECT_THAT(Error("security { clients { certificate_name: 'a' tenant: 'A' scope: READ } }"), HasSubstr("tenant 'A'"));
-  EXPECT_THAT(Error("security { clients { certificate_name: 'a' tenant: 'a' } }"), HasSubstr("scope must be"));
+  EXPECT_THAT(Error("security { clients { certificate_name: 'a' tenant: 'a' } }"), HasSubstr("scope: must be"));
   EXPECT_THAT(Error("quotas { sessions: 1 } quotas { tenant: '!' }"), HasSubstr("quotas[1]: tenant '!'"));
   EXPECT_THAT(Error("quotas { samples_per_s: nan }"), HasSubstr("quotas[0].samples_per_s is nan"));
   EXPECT_THAT(Error("limits { dataset_bytes: 18446744073709551615 }"),
