@@ -1,10 +1,13 @@
 #include "client/cli/data_files.h"
 
 #include <CLI/CLI.hpp>
+#include <fstream>
+#include <sstream>
 #include <utility>
 
 #include "absl/strings/str_join.h"
 #include "absl/strings/str_split.h"
+#include "client/cli/mat_file.h"
 #include "core/base/status.h"
 
 namespace metaekf::cli {
@@ -96,11 +99,21 @@ absl::Status WithColumnHint(const absl::Status& status) {
                    "; say which columns are meant with --inputs, --outputs and --states"));
 }
 
+absl::StatusOr<std::shared_ptr<std::istream>> OpenDataFile(const std::string& path) {
+  if (IsMatFile(path)) {
+    METAEKF_ASSIGN_OR_RETURN(std::string text, ReadMatFileAsCsv(path));
+    return std::make_shared<std::istringstream>(std::move(text));
+  }
+  METAEKF_ASSIGN_OR_RETURN(std::ifstream file, data::OpenForReading(path));
+  return std::make_shared<std::ifstream>(std::move(file));
+}
+
 absl::StatusOr<data::Dataset> ReadData(const std::vector<std::string>& paths,
                                        const data::CsvOptions& options) {
   data::Dataset all;
   for (const std::string& path : paths) {
-    absl::StatusOr<data::Dataset> read = data::ReadCsvFile(path, options);
+    METAEKF_ASSIGN_OR_RETURN(const std::shared_ptr<std::istream> file, OpenDataFile(path));
+    absl::StatusOr<data::Dataset> read = data::ReadCsv(*file, path, options);
     if (!read.ok()) return WithColumnHint(read.status());
     if (all.trajectories.empty()) {
       all.input_names = read->input_names;

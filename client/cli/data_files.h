@@ -1,5 +1,6 @@
 #pragma once
 
+#include <istream>
 #include <memory>
 #include <optional>
 #include <string>
@@ -43,8 +44,12 @@ data::CsvOptions FreeColumns(const DataFlags& flags);
 absl::StatusOr<data::CsvOptions> ModelColumns(const DataFlags& flags, const TargetModel& model,
                                               bool with_states);
 
+/// A data file as a stream of CSV; one that ends in .mat is read as ReadMatFileAsCsv says. Errors: NotFound, PermissionDenied;
+/// those of ReadMatFileAsCsv.
+absl::StatusOr<std::shared_ptr<std::istream>> OpenDataFile(const std::string& path);
+
 /// Reads one file or several, whose trajectories then carry the file's name as well. Errors: those
-/// of data::ReadCsvFile, with what to do about a wrong column; files with different columns.
+/// of OpenDataFile and data::ReadCsv, with what to do about a wrong column; files with different columns.
 absl::StatusOr<data::Dataset> ReadData(const std::vector<std::string>& paths,
                                        const data::CsvOptions& options);
 

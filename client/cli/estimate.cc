@@ -132,10 +132,9 @@ absl::StatusOr<SampleSender> OpenData(const Flags& flags, const TargetModel& mod
     return SampleSender::Open(std::shared_ptr<std::istream>(&console.in, [](std::istream*) {}),
                               "standard input", options);
   }
-  METAEKF_RETURN_IF_ERROR(ReadFile(flags.data).status());
+  METAEKF_ASSIGN_OR_RETURN(std::shared_ptr<std::istream> file, OpenDataFile(flags.data));
   options.samples_per_message = kSamplesPerMessage;
-  return SampleSender::Open(std::make_shared<std::ifstream>(flags.data, std::ios::binary),
-                            flags.data, options);
+  return SampleSender::Open(std::move(file), flags.data, options);
 }
 
 void PrintSummary(Console& console, const Summary& summary, size_t output_size, const std::string& session) {

@@ -21,16 +21,6 @@ absl::Status OpenError(const std::string& path, const char* verb) {
       absl::StrCat("cannot ", verb, " ", path, ": ", std::strerror(error)));
 }
 
-absl::StatusOr<std::ifstream> OpenForReading(const std::string& path) {
-  std::error_code ignored;
-  if (std::filesystem::is_directory(path, ignored)) {
-    return absl::NotFoundError(absl::StrCat("cannot read ", path, ": it is a directory"));
-  }
-  std::ifstream file(path, std::ios::binary);
-  if (!file) return OpenError(path, "read");
-  return file;
-}
-
 /// Collects the rows of one trajectory; the matrices are made when their number is known.
 struct Columns {
   std::vector<double> inputs, outputs, states;
@@ -130,6 +120,16 @@ bool AppendValues(const Eigen::MatrixXd& signal, Eigen::Index t, std::string& li
 }
 
 }  // namespace
+
+absl::StatusOr<std::ifstream> OpenForReading(const std::string& path) {
+  std::error_code ignored;
+  if (std::filesystem::is_directory(path, ignored)) {
+    return absl::NotFoundError(absl::StrCat("cannot read ", path, ": it is a directory"));
+  }
+  std::ifstream file(path, std::ios::binary);
+  if (!file) return OpenError(path, "read");
+  return file;
+}
 
 absl::StatusOr<Dataset> ReadCsv(std::istream& stream, const std::string& source,
                                 const CsvOptions& options) {

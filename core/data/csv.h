@@ -1,6 +1,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <fstream>
 #include <istream>
 #include <ostream>
 #include <string>
@@ -24,6 +25,9 @@ namespace metaekf::data {
 absl::StatusOr<Dataset> ReadCsv(std::istream& stream, const std::string& source,
                                 const CsvOptions& options = {});
 absl::StatusOr<Dataset> ReadCsvFile(const std::string& path, const CsvOptions& options = {});
+
+/// Opens a file to be read as it stands. Errors: NotFound or PermissionDenied.
+absl::StatusOr<std::ifstream> OpenForReading(const std::string& path);
 
 /// Writes `dataset` so that ReadCsv gives it back, number by number (NaN for NaN).
 ///

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <algorithm>
 #include <fstream>
 #include <iterator>
 #include <sstream>
@@ -30,8 +31,9 @@ inline Outcome RunMetaekf(const std::vector<std::string>& arguments,
 /// A path for this test alone.
 inline std::string TempPath(const std::string& name) {
   const auto* test = ::testing::UnitTest::GetInstance()->current_test_info();
-  return ::testing::TempDir() + "metaekf_" + test->test_suite_name() + "_" + test->name() + "_" +
-         name;
+  std::string owner = std::string(test->test_suite_name()) + "_" + test->name();
+  std::replace(owner.begin(), owner.end(), '/', '_');  // of a parametrised test
+  return ::testing::TempDir() + "metaekf_" + owner + "_" + name;
 }
 
 /// Writes a file for this test and gives its path.
