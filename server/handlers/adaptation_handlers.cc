@@ -33,7 +33,9 @@ absl::Status DeleteAdaptation(CallContext& context,
                               const v1::DeleteAdaptationRequest& request,
                               google::protobuf::Empty*) {
   METAEKF_ASSIGN_OR_RETURN(const std::string id, ParseAdaptationName("name", request.name()));
-  return context.store.adaptations().Delete(id);
+  METAEKF_RETURN_IF_ERROR(context.store.adaptations().Delete(id));
+  context.server.models.Forget(context.caller.tenant, AdaptationName(id));
+  return absl::OkStatus();
 }
 
 }  // namespace metaekf::server

@@ -70,7 +70,9 @@ absl::Status DeleteModelAlias(CallContext& context,
 absl::Status DeleteModelVersion(CallContext& context,
                                 const v1::DeleteModelVersionRequest& request, Empty*) {
   METAEKF_ASSIGN_OR_RETURN(const Target target, ParseVersionName("name", request.name()));
-  return context.store.models().DeleteVersion(target.model, target.version);
+  METAEKF_RETURN_IF_ERROR(context.store.models().DeleteVersion(target.model, target.version));
+  context.server.models.Forget(context.caller.tenant, VersionName(target.model, target.version));
+  return absl::OkStatus();
 }
 
 absl::StatusOr<store::ModelVersion> ResolveVersion(store::ModelStore& models,

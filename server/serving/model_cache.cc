@@ -161,6 +161,18 @@ void ModelCache::Keep(const Model& model) {
   }
 }
 
+void ModelCache::Forget(const std::string& tenant, const std::string& name) {
+  const std::string key = absl::StrCat(tenant, "/", name), of_adaptation = key + "@";
+  std::lock_guard lock(mutex_);
+  for (const auto& [known, held] : known_) {
+    if (known != key && known.rfind(of_adaptation, 0) != 0) continue;
+    const auto kept = std::find(recent_.begin(), recent_.end(), held.lock());
+    if (kept == recent_.end()) continue;
+    recent_bytes_ -= SizeBytes(**kept);
+    recent_.erase(kept);
+  }
+}
+
 ModelCache::Resident ModelCache::resident() {
   std::lock_guard lock(mutex_);
   Resident resident{.kept_bytes = recent_bytes_};

@@ -50,6 +50,10 @@ class ModelCache {
   absl::StatusOr<Model> Get(const std::string& tenant, const std::string& field,
                             const std::string& target);
 
+  /// Keeps a version or adaptation no longer, since it is deleted; who holds it has it still.
+  /// @param name  models/{model}/versions/{version} or adaptations/{adaptation}.
+  void Forget(const std::string& tenant, const std::string& name);
+
   /// Models in memory, whoever holds them.
   struct Resident {
     int64_t models = 0;

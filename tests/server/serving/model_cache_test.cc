@@ -103,6 +103,26 @@ TEST_F(ModelCacheTest, OverTheBudgetOnlyTheLatestAndThoseInUseStay) {
   EXPECT_EQ(cache.Get(store::kDefaultTenant, "f", "models/robot/versions/2").value(), second);
 }
 
+TEST_F(ModelCacheTest, WhatIsDeletedIsKeptByWhoHoldsItAlone) {
+  Add(1);
+  Adapt("mine", 2);
+  Adapt("mine2", 3);
+  ModelCache cache(*store_, kAmple);
+  auto held = cache.Get(store::kDefaultTenant, "f", "adaptations/mine").value();
+  cache.Get(store::kDefaultTenant, "f", "adaptations/mine2").value();
+  const ModelCache::Resident before = cache.resident();
+  EXPECT_EQ(before.models, 3);  // with their base
+  cache.Forget("another tenant", "adaptations/mine");
+  EXPECT_EQ(cache.resident().kept_bytes, before.kept_bytes);
+  cache.Forget(store::kDefaultTenant, "adaptations/mine");
+  EXPECT_EQ(cache.resident().models, 3);
+  EXPECT_LT(cache.resident().kept_bytes, before.kept_bytes);
+  held.reset();
+  EXPECT_EQ(cache.resident().models, 2);
+  cache.Forget(store::kDefaultTenant, "models/robot/versions/1");
+  EXPECT_EQ(cache.resident().models, 1);
+}
+
 TEST_F(ModelCacheTest, ManyAtOnceGetOneModel) {
   Add(1);
   ModelCache cache(*store_, kAmple);
