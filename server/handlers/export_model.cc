@@ -1,6 +1,7 @@
 #include "core/base/status.h"
 #include "server/convert/models.h"
 #include "server/handlers/model_handlers.h"
+#include "server/names/resource_names.h"
 
 namespace metaekf::server {
 namespace {
@@ -18,7 +19,7 @@ class Export final : public ResponseSource<Response> {
     store::ModelStore& models = context_.store.models();
     METAEKF_ASSIGN_OR_RETURN(version_, ResolveVersion(models, "name", name_));
     METAEKF_ASSIGN_OR_RETURN(file_, models.ReadFile(version_));
-    return absl::OkStatus();
+    return context_.store.AuditUse("ExportModelVersion", VersionName(version_.model, version_.version));
   }
 
   absl::StatusOr<bool> Next(Response* response) override {

@@ -77,7 +77,7 @@ class PredictCall final : public TrajectoryCall<Request, Response> {
 }  // namespace
 
 std::unique_ptr<StreamHandler<Request, Response>> Predict(CallContext context) {
-  return std::make_unique<PredictCall>(std::move(context));
+  return std::make_unique<PredictCall>(std::move(context), "Predict");
 }
 
 }  // namespace metaekf::server

@@ -81,7 +81,7 @@ class SmoothCall final : public TrajectoryCall<Request, Response> {
 }  // namespace
 
 std::unique_ptr<StreamHandler<Request, Response>> Smooth(CallContext context) {
-  return std::make_unique<SmoothCall>(std::move(context));
+  return std::make_unique<SmoothCall>(std::move(context), "Smooth");
 }
 
 }  // namespace metaekf::server

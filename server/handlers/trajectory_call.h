@@ -17,7 +17,8 @@ namespace metaekf::server {
 template <class Request, class Response>
 class TrajectoryCall : public StreamHandler<Request, Response> {
  public:
-  explicit TrajectoryCall(CallContext context) : context_(std::move(context)) {}
+  /// @param method  for the audit log.
+  TrajectoryCall(CallContext context, const char* method) : context_(std::move(context)), method_(method) {}
 
   absl::Status OnRequest(Request& request, ResponseSink<Response>& sink) final {
     if (!assembler_) {
@@ -52,6 +53,8 @@ class TrajectoryCall : public StreamHandler<Request, Response> {
     METAEKF_ASSIGN_OR_RETURN(model_, context_.server.models.Get(context_.caller.tenant, "header.target", header.target()));
     METAEKF_ASSIGN_OR_RETURN(const ChannelCounts channels, MatchChannels("header.channels", header.channels(), model_->bundle));
     METAEKF_RETURN_IF_ERROR(TakeHeader(header));
+    METAEKF_RETURN_IF_ERROR(
+        context_.store.AuditUse(method_, model_->adaptation.empty() ? model_->model_version : model_->adaptation));
     assembler_.emplace(SampleRules{.channels = channels,
                                    .missing_measurements = true,
                                    .sample_period_s = model_->bundle.sample_period_s,
@@ -60,6 +63,7 @@ class TrajectoryCall : public StreamHandler<Request, Response> {
   }
 
   CallContext context_;
+  const char* const method_;
   std::shared_ptr<const ServedModel> model_;
   std::optional<TrajectoryAssembler> assembler_;  // once the header is there
 };

@@ -3,6 +3,7 @@
 #include <string>
 
 #include "server/store/adaptations.h"
+#include "server/store/audit.h"
 #include "server/store/context.h"
 #include "server/store/jobs.h"
 #include "server/store/models.h"
@@ -27,6 +28,11 @@ class TenantStore {
   SessionStore& sessions() { return sessions_; }
   const BlobStore& blobs() const { return context_.blobs; }
   const std::string& tenant() const { return context_.tenant; }
+
+  /// Writes down that context.identity was served with a model version or adaptation.
+  absl::Status AuditUse(const std::string& action, const std::string& resource) {
+    return context_.database.Write([&](Connection& connection) { return Audit(context_, connection, action, resource); });
+  }
 
  private:
   Context context_;

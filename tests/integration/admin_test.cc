@@ -13,6 +13,7 @@ namespace {
 using metaekf::testing::Outcome;
 using metaekf::testing::TempFile;
 using ::testing::AllOf;
+using ::testing::ElementsAre;
 using ::testing::HasSubstr;
 using ::testing::Not;
 
@@ -119,6 +120,30 @@ TEST_F(AdminTest, WhoDidWhatIsTold) {
   EXPECT_EQ(all[2]["identity"], "metaekfd create-token");
   EXPECT_EQ(Json(Run(admin_, {"admin", "audit", "--tenant", "plant", "--output", "json"})).size(), 1u);
   EXPECT_EQ(Json(Run(admin_, {"admin", "audit", "--last", "2", "--output", "json"})).size(), 2u);
+}
+
+TEST_F(AdminTest, WhatServedWhomIsTold) {
+  const std::string press = TempFile("press", Create("plant", "write")["secret"].get<std::string>());
+  const std::string model = TempFile("m.safetensors", nssm::WriteModelFile(TinyStateBundle()));
+  const std::string data = TempFile("d.csv", "u1,y1,x1,x2\n0,0,0,0\n0,0,0,0\n0,0,0,0\n");
+  const std::vector<std::vector<std::string>> commands = {
+      {"models", "import", "robot", model},
+      {"models", "import", "robot", model},
+      {"predict", "--model", "robot@1", "--data", data, "--mode", "simulate"},
+      {"estimate", "--model", "robot", "--data", data},
+      {"estimate", "--model", "robot", "--data", data, "--smooth"},
+      {"models", "export", "robot@1", metaekf::testing::TempPath("out.safetensors")}};
+  for (const auto& command : commands) {
+    const Outcome outcome = Run(press, command);
+    ASSERT_EQ(outcome.status, 0) << command[0] << ": " << outcome.err << outcome.out;
+  }
+  std::vector<std::string> told;
+  for (const auto& entry : Json(Run(admin_, {"admin", "audit", "--tenant", "plant", "--output", "json"}))) {
+    told.push_back(entry["action"].get<std::string>() + " " + entry["resource"].get<std::string>() + " " + entry["detail"].get<std::string>());
+  }
+  told.resize(4);  // the newest
+  EXPECT_THAT(told, ElementsAre("ExportModelVersion models/robot/versions/1 ", "Smooth models/robot/versions/2 ",
+                                "OpenSession sessions/1 models/robot/versions/2", "Predict models/robot/versions/1 "));
 }
 
 TEST_F(AdminTest, MistakesAreNamed) {
