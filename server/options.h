@@ -48,9 +48,14 @@ struct ServerOptions {
     std::string worker_binary = "/proc/self/exe";
   } training;
 
+  struct Sessions {
+    absl::Duration checkpoint_period = absl::Milliseconds(100);  ///< 0: only at the end of a stream or the server
+  } sessions;
+
   struct Limits {
     int64_t memory_bytes = int64_t{64} << 20;  ///< of gRPC's buffers
     int64_t message_bytes = int64_t{4} << 20;
+    int64_t batch_bytes = int64_t{16} << 20;  ///< of batches and answers that streams hold
     int64_t metadata_bytes = int64_t{16} << 10;
     int64_t streams_per_connection = 1024;
     int64_t model_file_bytes = int64_t{256} << 20;

@@ -147,6 +147,13 @@ absl::Status ApplyConfig(const std::string& text, ServerOptions* options) {
   taker.Seconds("training.checkpoint_period_s", training.has_checkpoint_period_s(),
                 training.checkpoint_period_s(), &jobs.checkpoint_period);
 
+  if (config.sessions().has_checkpoint_period_s() && config.sessions().checkpoint_period_s() == 0) {
+    options->sessions.checkpoint_period = absl::ZeroDuration();
+  } else {
+    taker.Seconds("sessions.checkpoint_period_s", config.sessions().has_checkpoint_period_s(),
+                  config.sessions().checkpoint_period_s(), &options->sessions.checkpoint_period);
+  }
+
   const v1::ServerConfig::Limits& given = config.limits();
   ServerOptions::Limits& limits = options->limits;
   constexpr uint64_t kKilo = 1024, kLeastMemory = 8 << 20;
@@ -154,6 +161,8 @@ absl::Status ApplyConfig(const std::string& text, ServerOptions* options) {
               &limits.memory_bytes);
   taker.Count("limits.message_bytes", given.has_message_bytes(), given.message_bytes(), kKilo,
               &limits.message_bytes);
+  taker.Count("limits.batch_bytes", given.has_batch_bytes(), given.batch_bytes(), kKilo,
+              &limits.batch_bytes);
   taker.Count("limits.metadata_bytes", given.has_metadata_bytes(), given.metadata_bytes(), kKilo,
               &limits.metadata_bytes);
   taker.Count("limits.streams_per_connection", given.has_streams_per_connection(),

@@ -34,7 +34,7 @@ struct BatchQueue::Lane {
 
   absl::Status Begin() {
     if (batch.live->taken_over) return TakenOver();
-    return session().Begin(*batch.samples, batch.estimates, &application);
+    return session().Begin(*batch.samples, batch.goes_on, batch.estimates, &application);
   }
   Session& session() const { return *batch.live->session; }
   void End(const absl::Status& status) {

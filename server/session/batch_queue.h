@@ -47,6 +47,7 @@ class BatchQueue {
   struct Batch {
     std::shared_ptr<LiveSession> live;
     const v1::SampleBatch* samples = nullptr;
+    bool goes_on = false;  ///< see Session::Apply
     v1::EstimateBatch* estimates = nullptr;
     /// @param cost  the batch's share of the time that it took.
     std::function<void(const absl::Status&, std::chrono::steady_clock::duration cost)> done;

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <limits>
 #include <optional>
+#include <tuple>
+#include <utility>
 #include <vector>
 
 #include "absl/strings/str_cat.h"
@@ -24,7 +26,22 @@ constexpr std::chrono::milliseconds kSweepPeriod(500);
 // Longer batches go to threads of their own. To wake one costs as much as 64 samples of a small model.
 constexpr std::chrono::microseconds kLongReaction(200);
 
-constexpr int kManyRows = 128;  // in a batch, whose memory is not kept for the next
+// Messages up to here are a part of what a session takes; larger ones are counted, and their memory is not kept for the next.
+constexpr int64_t kSmallBytes = 8 << 10;
+constexpr int64_t kLargeBytes = 64 << 10;                // requests that are refused where too much is held
+constexpr std::chrono::milliseconds kShedPatience(100);  // what has waited less may be under way
+constexpr std::chrono::milliseconds kShedPeriod(20);
+
+int64_t BytesOf(const v1::EstimateRequest& request) {
+  if (request.has_forecast()) return 8 * request.forecast().inputs_size();
+  const v1::SampleBatch& samples = request.samples();
+  return 8 * (int64_t{samples.inputs_size()} + samples.outputs_size() + samples.times_s_size() + samples.measurement_noise_covs_size());
+}
+
+absl::Status TooMuchHeld(const char* advice) {
+  return WithRetryDelay(absl::ResourceExhaustedError(absl::StrCat("streams hold more batches than the server has memory for; ", advice)),
+                        absl::Seconds(1));
+}
 
 absl::Status Draining(uint64_t durable_seq) {
   return WithReason(
@@ -35,8 +52,8 @@ absl::Status Draining(uint64_t durable_seq) {
 }  // namespace
 
 /// One stream: open or resume, then batch by batch. At any time at most one read and one write are in flight and one
-/// batch is in work; the next batch waits for the response before it. `mutex_` guards everything; the batch itself is
-/// applied without it.
+/// batch is in work; the next batch, or the rest of a large one, waits for the response before it. `mutex_` guards everything;
+/// the batch itself is applied without it.
 class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::EstimateResponse> {
  public:
   EstimateStream(EstimationService* service, grpc::CallbackServerContext* context, std::shared_ptr<CallRecord> record,
@@ -59,13 +76,19 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
     read_time_ = steady_clock::now();
     reading_ = false;
     (ok ? has_request_ : half_closed_) = true;
+    if (ok && BytesOf(request_) > kLargeBytes && service_.HoldsTooMuch()) {
+      has_request_ = false;
+      request_ = v1::EstimateRequest();
+      EndForMemory("send smaller ones, or again in a second");
+    }
     Advance();
   }
 
   void OnWriteDone(bool ok) override {
     std::lock_guard lock(mutex_);
     writing_ = false;
-    if (response_.estimates().nis_size() > kManyRows) ForgetLargeMessages();
+    if (answer_bytes_ > kSmallBytes) response_ = v1::EstimateResponse();
+    if (!goes_on_ && BytesOf(work_) > kSmallBytes) work_ = v1::EstimateRequest();  // which the next is read into
     if (!ok) End(absl::CancelledError("the client has gone"));
     Advance();
   }
@@ -82,6 +105,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
     // A lost connection looks like the end of the requests first.
     const bool all_arrived = finish_with_ && finish_with_->ok() && !context_->IsCancelled();
     if (live_ != nullptr) service_.sessions_.Close(live_, all_arrived);
+    service_.CountHeld(-counted_bytes_);
     service_.Remove(this);
     delete this;
   }
@@ -120,13 +144,37 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
 
   void Cancel() { context_->TryCancel(); }
 
+  /// What the stream holds while it waits for its client, and since when; nothing if it is at work or has not waited long.
+  std::optional<std::pair<steady_clock::time_point, int64_t>> Waits(steady_clock::time_point now) {
+    std::lock_guard lock(mutex_);
+    const steady_clock::time_point since = writing_ ? write_start_ : read_time_;
+    if (working_ || finish_with_ || counted_bytes_ == 0 || now - since < kShedPatience) return std::nullopt;
+    return std::pair(since, counted_bytes_);
+  }
+
+  void Shed() {
+    std::lock_guard lock(mutex_);
+    EndForMemory("read faster, or send smaller ones");
+    Advance();
+  }
+
  private:
   void End(absl::Status status) {
     if (!finish_with_) finish_with_ = std::move(status);
   }
 
+  void EndForMemory(const char* advice) {
+    End(TooMuchHeld(advice));
+    if (writing_) context_->TryCancel();  // an outstanding write ends only so
+  }
+
   /// Starts whatever may start now. With mutex_ held; every event ends here.
   void Advance() {
+    StartNext();
+    Account();
+  }
+
+  void StartNext() {
     if (finished_ || working_) return;
     if (finish_with_) {
       if (writing_) return;
@@ -136,18 +184,20 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
     }
     // Beyond its tenant's rate a request waits, and with it the client; the next sweep looks again.
     const bool may_work = rate_ == nullptr || rate_->IsReady(steady_clock::now());
-    if (has_request_ && !writing_ && !stop_applying_ && may_work) {
-      has_request_ = false;
-      request_.Swap(&work_);
-      work_time_ = read_time_;
+    if ((goes_on_ || has_request_) && !writing_ && !stop_applying_ && may_work) {
+      if (!goes_on_) {
+        has_request_ = false;
+        request_.Swap(&work_);
+        work_time_ = read_time_;
+      }
       working_ = true;
       StartWork();
       return;
     }
-    if (half_closed_ && !has_request_) {
+    if (half_closed_ && !has_request_ && !goes_on_) {
       End(live_ == nullptr ? absl::InvalidArgumentError("the first request must open or resume a session")
                            : absl::OkStatus());
-      return Advance();
+      return StartNext();
     }
     Read();
   }
@@ -166,7 +216,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
     Read();
     if (live_ != nullptr && queues()) {
       response_.Clear();
-      if (live_->queue->Add({live_, &work_.samples(), response_.mutable_estimates(), [this](const absl::Status& status, auto cost) { Applied(status, cost); }})) {
+      if (live_->queue->Add({live_, &work_.samples(), goes_on_, response_.mutable_estimates(), [this](const absl::Status& status, auto cost) { Applied(status, cost); }})) {
         service_.WorkThrough(live_->queue);
       }
       return;
@@ -182,7 +232,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   void Applied(const absl::Status& status, steady_clock::duration cost) {
     if (response_.estimates().nis_size() > 0) {
       service_.sessions_.MarkDirty(live_);
-      time_per_value_ = cost / work_.samples().outputs_size();
+      time_per_value_ = cost / (int64_t{response_.estimates().nis_size()} * output_size_);
     }
     std::lock_guard lock(mutex_);
     WorkDone(status);
@@ -205,6 +255,8 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   /// With mutex_ held.
   void WorkDone(const absl::Status& status) {
     working_ = false;
+    goes_on_ = status.ok() && HasRest();
+    answer_bytes_ = row_bytes_ * (int64_t{response_.estimates().nis_size()} + response_.forecast().nis_size());
     if (status.ok() && response_.estimates().nis_size() > 0) Count(response_.estimates());
     if (!status.ok()) {
       End(status);
@@ -216,11 +268,23 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
     Advance();
   }
 
-  /// Messages keep the memory that they once had. With mutex_ held, between a batch and the next.
-  void ForgetLargeMessages() {
-    response_ = v1::EstimateResponse();
-    work_ = v1::EstimateRequest();
-    if (!reading_ && !has_request_) request_ = v1::EstimateRequest();
+  /// Whether the answer does not reach the batch's end: it holds so much and no more.
+  bool HasRest() const {
+    const v1::EstimateBatch& estimates = response_.estimates();
+    if (!work_.has_samples() || estimates.nis().empty()) return false;
+    const auto rows = static_cast<uint64_t>(work_.samples().outputs_size() / output_size_);
+    return estimates.first_seq() + static_cast<uint64_t>(estimates.nis_size()) < work_.samples().first_seq() + rows;
+  }
+
+  /// Tells the service how much the stream holds. With mutex_ held.
+  void Account() {
+    int64_t bytes = has_request_ ? BytesOf(request_) : 0;
+    if (working_ || goes_on_) bytes += BytesOf(work_);
+    if (writing_) bytes += 2 * answer_bytes_;  // as a message, and as gRPC holds it
+    if (bytes <= kSmallBytes) bytes = 0;
+    if (bytes == counted_bytes_) return;
+    service_.CountHeld(bytes - counted_bytes_);
+    counted_bytes_ = bytes;
   }
 
   /// With mutex_ held, after each batch.
@@ -259,6 +323,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
       opened->set_epoch((*live)->epoch);
       opened->set_durable_seq((*live)->durable_seq);
       output_size_ = opened->output_size();
+      row_bytes_ = (*live)->session->row_bytes();
       // A batch of the largest models takes about 20 ns per parameter and output; measured from the first batch on.
       time_per_value_ = std::chrono::nanoseconds(
           static_cast<int64_t>((*live)->session->model().bundle.parameters.size()));
@@ -292,14 +357,14 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
         forecast->set_durable_seq(live_->durable_seq);
       } else {
         v1::EstimateBatch* estimates = response_.mutable_estimates();
-        status = live_->session->Apply(work_.samples(), scratch.get(), estimates);
+        status = live_->session->Apply(work_.samples(), goes_on_, scratch.get(), estimates);
         CompleteAnswer(work_.samples(), *live_, estimates);
         applied = estimates->nis_size() > 0;
       }
     }
     live_->queue->GiveBack(std::move(scratch));
     if (applied) service_.sessions_.MarkDirty(live_);
-    const int64_t values = ValuesOf(work_);
+    const int64_t values = output_size_ * (int64_t{response_.estimates().nis_size()} + response_.forecast().nis_size());
     if (values > 0) time_per_value_ = (steady_clock::now() - start) / values;
     return status;
   }
@@ -315,6 +380,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   v1::EstimateResponse response_;  // being made or written
   std::shared_ptr<LiveSession> live_;
   int64_t output_size_ = 0;
+  int64_t row_bytes_ = 0;
   steady_clock::duration time_per_value_{};  // of outputs in a batch, as last measured
 
   std::mutex mutex_;
@@ -322,6 +388,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   bool has_request_ = false;  // request_ holds a request that waits
   bool half_closed_ = false;
   bool working_ = false;
+  bool goes_on_ = false;  // work_ has a rest, for the next answer
   bool writing_ = false;
   bool stop_applying_ = false;
   bool finished_ = false;
@@ -329,6 +396,8 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   steady_clock::time_point read_time_;   // of request_
   steady_clock::time_point work_time_;   // when work_ was read
   steady_clock::time_point write_start_;
+  int64_t answer_bytes_ = 0;   // of response_
+  int64_t counted_bytes_ = 0;  // that the service knows of
 };
 
 EstimationService::EstimationService(const ServiceContext& server, SessionManager& sessions)
@@ -374,9 +443,35 @@ void EstimationService::Remove(EstimateStream* stream) {
 // Streams leave the set, with mutex_, before they are deleted: what is found in it while mutex_ is held is alive.
 void EstimationService::RunSweeps() {
   std::unique_lock lock(mutex_);
-  while (!changed_.wait_for(lock, kSweepPeriod, [this] { return stopping_; })) {
+  steady_clock::time_point next_sweep = steady_clock::now() + kSweepPeriod;
+  while (!stopping_) {
+    changed_.wait_until(lock, std::min(next_sweep, HoldsTooMuch() ? steady_clock::now() + kShedPeriod : next_sweep));
     const steady_clock::time_point now = steady_clock::now();
+    if (HoldsTooMuch()) Shed(now);
+    if (now < next_sweep) continue;
     for (EstimateStream* stream : streams_) stream->Sweep(now);
+    next_sweep = now + kSweepPeriod;
+  }
+}
+
+void EstimationService::CountHeld(int64_t change) {
+  const int64_t before = held_bytes_.fetch_add(change), most = server_.options.limits.batch_bytes;
+  if (before <= most && before + change > most) changed_.notify_all();
+}
+
+bool EstimationService::HoldsTooMuch() const { return held_bytes_ > server_.options.limits.batch_bytes; }
+
+void EstimationService::Shed(steady_clock::time_point now) {
+  std::vector<std::tuple<steady_clock::time_point, int64_t, EstimateStream*>> waiting;
+  for (EstimateStream* stream : streams_) {
+    if (const auto waits = stream->Waits(now)) waiting.emplace_back(waits->first, waits->second, stream);
+  }
+  std::sort(waiting.begin(), waiting.end());
+  int64_t over = held_bytes_ - server_.options.limits.batch_bytes;
+  for (const auto& [since, bytes, stream] : waiting) {
+    if (over <= 0) return;
+    stream->Shed();
+    over -= bytes;
   }
 }
 

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <chrono>
 #include <condition_variable>
 #include <memory>
@@ -48,9 +49,16 @@ class EstimationService : public v1::EstimationService::CallbackService {
   void WorkThrough(const std::shared_ptr<BatchQueue>& queue);
   void RunSweeps();
 
+  /// A stream holds so much more, or less, of batches and answers than before.
+  void CountHeld(int64_t change);
+  bool HoldsTooMuch() const;
+  /// Ends the streams that have waited longest, until the rest holds no more than it may. With mutex_ held.
+  void Shed(std::chrono::steady_clock::time_point now);
+
   const ServiceContext& server_;
   SessionManager& sessions_;
   SampleRates rates_;
+  std::atomic<int64_t> held_bytes_ = 0;
   BackgroundExecutor heavy_;  // batches that take longer than a reaction may; each stream has one at most
 
   std::mutex mutex_;

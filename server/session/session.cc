@@ -29,6 +29,8 @@ constexpr int64_t kMaxMissedPeriods = 100'000;
 constexpr int64_t kMaxLag = 1000;              // periods
 constexpr int64_t kMaxHorizon = 10'000;        // samples
 constexpr int64_t kMaxRemembered = 64 << 20;   // bytes
+constexpr int64_t kAnswerBytes = 1 << 20;      // after which the rest of a batch goes into the next
+constexpr int64_t kForecastBytes = 4 << 20;    // more than which clients of gRPC refuse to receive
 
 /// Periods that a measurement may come late. Errors: InvalidArgument for a lag that is negative or too long to remember.
 absl::StatusOr<int64_t> ReadLag(const OpenSession& open, double period_s, const filter::Ekf& ekf) {
@@ -107,6 +109,7 @@ Session::Session(std::shared_ptr<const ServedModel> model, filter::ReplayFilter 
                                 : open.covariance_format(),
               .innovations = open.send_innovations(),
               .constrained = filter_.ekf().constrained()},
+      row_bytes_(RowBytes(format_, filter_.ekf().estimate_size(), filter_.ekf().output_size())),
       period_s_(model_->bundle.sample_period_s),
       nothing_(VectorXd::Constant(filter_.ekf().output_size(), std::numeric_limits<double>::quiet_NaN())) {}
 
@@ -199,10 +202,10 @@ absl::StatusOr<int64_t> Session::PeriodsTo(double time_s, double last_time_s, in
   return static_cast<int64_t>(whole);
 }
 
-absl::Status Session::Apply(const v1::SampleBatch& batch, filter::FilterModel::Scratch* scratch,
+absl::Status Session::Apply(const v1::SampleBatch& batch, bool goes_on, filter::FilterModel::Scratch* scratch,
                             EstimateBatch* estimates) {
   Application application;
-  METAEKF_RETURN_IF_ERROR(Begin(batch, estimates, &application));
+  METAEKF_RETURN_IF_ERROR(Begin(batch, goes_on, estimates, &application));
   while (true) {
     filter::NextReplaySample step;
     METAEKF_ASSIGN_OR_RETURN(const bool more, Next(&application, scratch, &step));
@@ -212,10 +215,12 @@ absl::Status Session::Apply(const v1::SampleBatch& batch, filter::FilterModel::S
   }
 }
 
-absl::Status Session::Begin(const v1::SampleBatch& batch, EstimateBatch* estimates, Application* application) const {
-  METAEKF_RETURN_IF_ERROR(Check(batch, batch.outputs_size() / filter_.ekf().output_size()));
+absl::Status Session::Begin(const v1::SampleBatch& batch, bool goes_on, EstimateBatch* estimates, Application* application) const {
+  if (!goes_on) METAEKF_RETURN_IF_ERROR(Check(batch, batch.outputs_size() / filter_.ekf().output_size()));
   *application = {.batch = &batch, .estimates = estimates};
   if (batch.first_seq() <= seq_) application->row = static_cast<int64_t>(seq_ + 1 - batch.first_seq());
+  const int64_t n_y = filter_.ekf().output_size(), rows = batch.outputs_size() / n_y - application->row;
+  if (rows > 1) Reserve(format_, filter_.ekf().estimate_size(), n_y, std::min(rows, kAnswerBytes / row_bytes_), estimates);
   return absl::OkStatus();
 }
 
@@ -225,6 +230,7 @@ absl::StatusOr<bool> Session::Next(Application* application, filter::FilterModel
   for (; application->row < rows; ++application->row) {
     const Eigen::Map<const VectorXd> u(batch.inputs().data() + application->row * n_u, n_u), y(batch.outputs().data() + application->row * n_y, n_y);
     if (!application->dated) {
+      if ((application->estimates->nis_size() + 1) * row_bytes_ > kAnswerBytes && !application->estimates->nis().empty()) return false;
       METAEKF_ASSIGN_OR_RETURN(const int64_t periods, Date(application));
       if (periods < 1) {
         const MatrixXd* const R = application->measurement_cov ? &*application->measurement_cov : nullptr;
@@ -288,6 +294,10 @@ absl::Status Session::Forecast(const v1::ForecastRequest& request, filter::Filte
   const int64_t n_u = filter_.ekf().input_size(), horizon = request.horizon();
   if (horizon < 1 || horizon > kMaxHorizon) {
     return FieldViolation("forecast.horizon", absl::StrCat("must be from 1 to ", kMaxHorizon, ", got ", horizon));
+  }
+  if (horizon * row_bytes_ > kForecastBytes) {
+    return FieldViolation("forecast.horizon", absl::StrCat("estimates of this session take ", row_bytes_, " bytes each; at most ",
+                                                           kForecastBytes / row_bytes_, " can be asked for at a time, got ", horizon));
   }
   if (request.inputs_size() != 0 && request.inputs_size() != horizon * n_u) {
     return FieldViolation("forecast.inputs", absl::StrCat("expected ", horizon, " × ", n_u, " values or none, got ", request.inputs_size()));

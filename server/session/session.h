@@ -20,11 +20,12 @@ class Session {
   static absl::StatusOr<std::unique_ptr<Session>> Open(std::shared_ptr<const ServedModel> model,
                                                        const v1::OpenSession& open);
 
-  /// Applies a batch and writes what it taught. Samples with numbers already applied are skipped; one that is not later than the
-  /// newest goes to its own time.
+  /// Applies a batch, or as much of it as one answer holds, and writes what it taught. Samples with numbers already applied are
+  /// skipped; one that is not later than the newest goes to its own time.
+  /// @param goes_on  the rest of a batch that was begun before, and is checked.
   /// Errors: InvalidArgument with violations below `samples`; OutOfRange (SEQUENCE_GAP) if numbers are missing. The
   /// session is unchanged then.
-  absl::Status Apply(const v1::SampleBatch& batch, filter::FilterModel::Scratch* scratch, v1::EstimateBatch* estimates);
+  absl::Status Apply(const v1::SampleBatch& batch, bool goes_on, filter::FilterModel::Scratch* scratch, v1::EstimateBatch* estimates);
 
   /// A batch on its way through a session, of which step by step is given to filter::StepTogether:
   ///
@@ -40,8 +41,9 @@ class Session {
     Eigen::VectorXd last_input;
   };
   /// Errors: those of Apply.
-  absl::Status Begin(const v1::SampleBatch& batch, v1::EstimateBatch* estimates, Application* application) const;
-  /// @param next  receives the next step, if there is one; it refers to `application`. What is late is applied on the way.
+  absl::Status Begin(const v1::SampleBatch& batch, bool goes_on, v1::EstimateBatch* estimates, Application* application) const;
+  /// @param next  receives the next step, if there is one and the answer has room; it refers to `application`. What is late is
+  /// applied on the way.
   absl::StatusOr<bool> Next(Application* application, filter::FilterModel::Scratch* scratch, filter::NextReplaySample* next);
   /// After the step.
   absl::Status Taught(const filter::NextReplaySample& step, Application* application);
@@ -56,6 +58,8 @@ class Session {
   absl::Status Restore(const std::string& checkpoint, filter::FilterModel::Scratch* scratch);
 
   uint64_t applied_seq() const { return seq_; }
+  /// What each estimate takes in an answer.
+  int64_t row_bytes() const { return row_bytes_; }
   const ServedModel& model() const { return *model_; }
   void Describe(v1::SessionOpened* opened) const;
 
@@ -75,6 +79,7 @@ class Session {
   filter::ReplayFilter filter_;
   filter::Estimate estimate_;
   const EstimateFormat format_;
+  const int64_t row_bytes_;
   const double period_s_;
   uint64_t seq_ = 0;    // the last sample applied
   double time_s_ = 0;   // of the newest

@@ -14,7 +14,6 @@
 namespace metaekf::server {
 namespace {
 
-constexpr std::chrono::milliseconds kCommitPeriod(100);
 constexpr size_t kMostWaiting = 16;  // checkpoints of one session: of a client that tells late
 
 /// What of a session may become durable now: sample number and checkpoint; nothing if that is so already. With its mutex held.
@@ -35,23 +34,33 @@ std::optional<std::pair<uint64_t, std::string>> NextDurable(LiveSession& live) {
 
 }  // namespace
 
-SessionManager::SessionManager(store::Store& store, ModelCache& models, std::shared_ptr<Metrics> metrics)
-    : store_(store), models_(models), metrics_(std::move(metrics)), checkpoints_([this] { RunCheckpoints(); }) {}
+SessionManager::SessionManager(store::Store& store, ModelCache& models, std::shared_ptr<Metrics> metrics, absl::Duration period)
+    : store_(store),
+      models_(models),
+      metrics_(std::move(metrics)),
+      period_(absl::ToChronoNanoseconds(period)),
+      checkpoints_([this] { RunCheckpoints(); }) {}
 
 SessionManager::~SessionManager() {
   {
     std::lock_guard lock(mutex_);
     stopping_ = true;
   }
-  stop_.notify_all();
+  changed_.notify_all();
   checkpoints_.join();
   Flush();
 }
 
 void SessionManager::RunCheckpoints() {
   std::unique_lock lock(mutex_);
-  while (!stop_.wait_for(lock, kCommitPeriod, [this] { return stopping_; })) {
-    if (dirty_.empty()) continue;
+  while (!stopping_) {
+    if (period_.count() > 0) {
+      changed_.wait_for(lock, period_, [this] { return stopping_; });
+    } else {
+      changed_.wait(lock, [this] { return stopping_ || closed_; });
+    }
+    closed_ = false;
+    if (dirty_.empty() || stopping_) continue;
     lock.unlock();
     Flush();
     lock.lock();
@@ -139,6 +148,8 @@ void SessionManager::Close(const std::shared_ptr<LiveSession>& live, bool all_ar
   std::lock_guard lock(mutex_);
   const auto it = live_.find({live->tenant, live->number});
   if (it != live_.end() && it->second == live) live_.erase(it);
+  closed_ = true;
+  if (period_.count() == 0) changed_.notify_all();
 }
 
 void SessionManager::Flush() {

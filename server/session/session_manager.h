@@ -1,5 +1,6 @@
 #pragma once
 
+#include <chrono>
 #include <condition_variable>
 #include <map>
 #include <memory>
@@ -22,7 +23,8 @@ namespace metaekf::server {
 /// SQL and files.
 class SessionManager {
  public:
-  SessionManager(store::Store& store, ModelCache& models, std::shared_ptr<Metrics> metrics);
+  /// @param period  between checkpoints; 0: only at the end of a stream and of the manager.
+  SessionManager(store::Store& store, ModelCache& models, std::shared_ptr<Metrics> metrics, absl::Duration period);
   ~SessionManager();
 
   /// @param mine  of the caller's tenant, here and below.
@@ -59,14 +61,16 @@ class SessionManager {
   store::Store& store_;
   ModelCache& models_;
   const std::shared_ptr<Metrics> metrics_;
+  const std::chrono::nanoseconds period_;
   std::mutex mutex_;
   std::map<std::pair<std::string, int64_t>, std::shared_ptr<LiveSession>> live_;  // by tenant and number
   std::set<std::shared_ptr<LiveSession>> dirty_;
   absl::Time dirty_since_ = absl::InfiniteFuture();  // the first of them
   absl::Time flushed_since_ = absl::InfiniteFuture();  // the first of those that are being written
   std::vector<std::weak_ptr<BatchQueue>> queues_;
+  bool closed_ = false;  // a stream has, since the last commit
   bool stopping_ = false;
-  std::condition_variable stop_;
+  std::condition_variable changed_;
   std::mutex flush_mutex_;  // one commit at a time
   std::thread checkpoints_;
 };

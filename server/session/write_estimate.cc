@@ -31,6 +31,34 @@ void AddLowerTriangle(const Eigen::MatrixXd& matrix, google::protobuf::RepeatedF
 
 }  // namespace
 
+int64_t RowBytes(const EstimateFormat& format, int64_t states, int64_t outputs) {
+  int64_t values = 2 + states;  // time and NIS
+  if (format.covariance == v1::OpenSession::DIAGONAL) values += states;
+  if (format.covariance == v1::OpenSession::LOWER_TRIANGLE) values += states * (states + 1) / 2;
+  if (format.innovations) values += outputs + outputs * (outputs + 1) / 2;
+  if (format.constrained) values += 2;
+  return 8 * values + 8;  // and health and flags
+}
+
+void Reserve(const EstimateFormat& format, int64_t states, int64_t outputs, int64_t rows, EstimateBatch* batch) {
+  const auto reserve = [rows](auto* values, int64_t per_row) { values->Reserve(static_cast<int>(rows * per_row)); };
+  reserve(batch->mutable_times_s(), 1);
+  reserve(batch->mutable_means(), states);
+  if (format.covariance == v1::OpenSession::DIAGONAL) reserve(batch->mutable_covariances(), states);
+  if (format.covariance == v1::OpenSession::LOWER_TRIANGLE) reserve(batch->mutable_covariances(), states * (states + 1) / 2);
+  if (format.innovations) {
+    reserve(batch->mutable_innovations(), outputs);
+    reserve(batch->mutable_innovation_covs(), outputs * (outputs + 1) / 2);
+  }
+  reserve(batch->mutable_nis(), 1);
+  reserve(batch->mutable_health(), 1);
+  reserve(batch->mutable_flags(), 1);
+  if (format.constrained) {
+    reserve(batch->mutable_slacks(), 1);
+    reserve(batch->mutable_projections(), 1);
+  }
+}
+
 void WriteEstimate(const EstimateFormat& format, double time_s, const filter::Estimate& estimate, uint32_t flags,
                    EstimateBatch* batch) {
   batch->add_times_s(time_s);

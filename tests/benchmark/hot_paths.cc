@@ -96,7 +96,7 @@ void EstimateBatch() {
     v1::EstimateRequest received;
     v1::EstimateResponse response;
     if (!received.ParseFromString(bytes) ||
-        !session->Apply(received.samples(), scratch.get(), response.mutable_estimates()).ok()) {
+        !session->Apply(received.samples(), false, scratch.get(), response.mutable_estimates()).ok()) {
       std::exit(1);
     }
     (void)response.SerializeAsString();

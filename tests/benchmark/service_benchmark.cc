@@ -109,6 +109,23 @@ std::vector<Row> Throughput(client::Client* client, const std::string& echo) {
           {"one stream, 64 samples a message, samples", "1/s", samples, messages, samples / messages, "stream_batch"}};
 }
 
+/// What it costs to write down what streams have taught.
+std::vector<Row> Checkpoints(client::Client* with, client::Client* without) {
+  std::vector<Row> rows;
+  for (const int batch : {1, kBatch}) {
+    std::vector<double> rates, rates_without;
+    for (int round = 0; round < kRounds; ++round) {
+      for (const auto& [client, into] : {std::pair(with, &rates), std::pair(without, &rates_without)}) {
+        EstimateStream stream(client, batch);
+        into->push_back(batch * Rate(&stream));
+      }
+    }
+    const double ours = Median(rates), peer = Median(rates_without);
+    rows.push_back({"samples, " + std::to_string(batch) + " a message, beside checkpoints off", "1/s", ours, peer, ours / peer, ""});
+  }
+  return rows;
+}
+
 template <class Stream>
 void AddLatencies(Stream* stream, std::vector<double>* latencies) {
   const std::vector<double> round = LatenciesAt100Hz(kSamplesAt100Hz, [&] { stream->Send(), stream->Receive(); });
@@ -313,6 +330,17 @@ int Main(const std::string& only, const std::string& json) {
     ours.End(SIGTERM);
     echo.End(SIGTERM);
   }
+  report("Checkpoints", [&] {
+    const std::string off = (data / "off.textproto").string();
+    std::ofstream(off) << "sessions { checkpoint_period_s: 0 }";
+    ServerProcess server = ServerProcess::Metaekfd((data / "on").string()), server_off = ServerProcess::Metaekfd((data / "off").string(), off);
+    client::Client with({.server = server.address()}), without({.server = server_off.address()});
+    for (client::Client* client : {&with, &without}) Check(client->ImportModel("van-der-pol", ZooModel()).status(), "importing");
+    std::vector<Row> rows = Checkpoints(&with, &without);
+    server.End(SIGTERM);
+    server_off.End(SIGTERM);
+    return rows;
+  });
   report("Growth", [&] {
     ServerProcess server = ServerProcess::Metaekfd((data / "growth").string()), echo(METAEKF_ECHO_BINARY, {});
     client::Client client({.server = server.address()});
@@ -324,7 +352,7 @@ int Main(const std::string& only, const std::string& json) {
   });
   report("Start", [&] { return Start((data / "start").string()); });
   std::filesystem::remove_all(data);
-  if (all.empty()) Fail("there is no table " + only + "; there are Streams, Latency, Large, Growth and Start");
+  if (all.empty()) Fail("there is no table " + only + "; there are Streams, Latency, Large, Checkpoints, Growth and Start");
   if (!json.empty() && !AddToJson(json, all)) Fail(json + " cannot be written");
   return 0;
 }

@@ -65,7 +65,7 @@ class BatchQueueTest : public testing::Test {
   }
 
   bool Add(Client* client) {
-    return queue_->Add({client->live, &client->batch, &client->answer, [client](const absl::Status& status, auto) { client->status = status; }});
+    return queue_->Add({client->live, &client->batch, false, &client->answer, [client](const absl::Status& status, auto) { client->status = status; }});
   }
 
   void WorkThrough() {
@@ -75,7 +75,7 @@ class BatchQueueTest : public testing::Test {
   static void ExpectAsAlone(Client* client) {
     v1::EstimateBatch alone;
     const auto scratch = client->alone->model().filter_model->MakeScratch();
-    EXPECT_EQ(client->status, client->alone->Apply(client->batch, scratch.get(), &alone));
+    EXPECT_EQ(client->status, client->alone->Apply(client->batch, false, scratch.get(), &alone));
     EXPECT_EQ(client->answer.SerializeAsString(), alone.SerializeAsString());
     EXPECT_EQ(client->live->session->Checkpoint(), client->alone->Checkpoint());
   }
@@ -110,7 +110,7 @@ TEST_F(BatchQueueTest, ABatchIsDoneWhenItsOwnSamplesAre) {
   for (const int samples : {5, 1, 3, 2}) {
     clients.push_back(MakeClient(static_cast<uint64_t>(samples)));
     MakeBatch(samples, clients.back().get());
-    queue_->Add({clients.back()->live, &clients.back()->batch, &clients.back()->answer, [&order, samples](const absl::Status&, auto) { order.push_back(samples); }});
+    queue_->Add({clients.back()->live, &clients.back()->batch, false, &clients.back()->answer, [&order, samples](const absl::Status&, auto) { order.push_back(samples); }});
   }
   WorkThrough();
   EXPECT_EQ(order, (std::vector<int>{1, 2, 3, 5}));
@@ -150,17 +150,17 @@ TEST_F(BatchQueueTest, NoBatchIsLostBetweenThreads) {
         MakeBatch(1 + i % 3, client.get());
         if (queue_->Enter()) {
           const auto scratch = queue_->Take();
-          client->status = client->live->session->Apply(client->batch, scratch.get(), &client->answer);
+          client->status = client->live->session->Apply(client->batch, false, scratch.get(), &client->answer);
           ++alone;
           if (queue_->Leave()) work();
         } else {
           const auto done = std::make_shared<std::promise<absl::Status>>();
-          if (queue_->Add({client->live, &client->batch, &client->answer, [done](const absl::Status& status, auto) { done->set_value(status); }})) work();
+          if (queue_->Add({client->live, &client->batch, false, &client->answer, [done](const absl::Status& status, auto) { done->set_value(status); }})) work();
           client->status = done->get_future().get();
         }
         v1::EstimateBatch expected;
         const auto scratch = client->alone->model().filter_model->MakeScratch();
-        EXPECT_EQ(client->status, client->alone->Apply(client->batch, scratch.get(), &expected));
+        EXPECT_EQ(client->status, client->alone->Apply(client->batch, false, scratch.get(), &expected));
         EXPECT_EQ(client->answer.SerializeAsString(), expected.SerializeAsString());
       }
     });

@@ -168,6 +168,51 @@ TEST_F(EstimationServiceTest, TheStreamEqualsTheFilterBitForBit) {
   }
 }
 
+TEST_F(EstimationServiceTest, ALargeBatchIsAnsweredInPieces) {
+  const Recording recording = MakeRecording(50'000, 0.05);
+  Call call = Start(OpenRequest());
+  const v1::SessionOpened opened = ReadOpened(call);
+  call.stream->Write(Batch(recording, 1, 50'000));
+  Estimates estimates;
+  v1::EstimateResponse response;
+  int pieces = 0;
+  for (uint64_t next = 1; next <= 50'000; ++pieces) {
+    ASSERT_TRUE(call.stream->Read(&response)) << call.stream->Finish().error_message();
+    ASSERT_EQ(response.estimates().first_seq(), next);
+    EXPECT_LT(response.ByteSizeLong(), size_t{1} << 20);
+    Append(response.estimates(), &estimates);
+    next += static_cast<uint64_t>(response.estimates().nis_size());
+  }
+  EXPECT_GT(pieces, 2);
+  ExpectIdentical(estimates, Direct(recording));
+  EXPECT_TRUE(End(call).ok());
+
+  // Checked as a whole before any of it is applied.
+  Call refused = Start(OpenRequest());
+  ReadOpened(refused);
+  v1::EstimateRequest wrong = Batch(recording, 1, 50'000);
+  wrong.mutable_samples()->set_inputs(49'999, std::numeric_limits<double>::infinity());
+  refused.stream->Write(wrong);
+  EXPECT_FALSE(refused.stream->Read(&response));
+  EXPECT_EQ(refused.stream->Finish().error_code(), grpc::StatusCode::INVALID_ARGUMENT);
+}
+
+TEST_F(EstimationServiceTest, AForecastThatNoClientCouldReceiveIsRefused) {
+  Import("wide", TinyStateBundle(16));  // 1.2 KB per estimate
+  Call call = Start(OpenRequest("models/wide"));
+  ReadOpened(call);
+  v1::EstimateRequest forecast;
+  v1::EstimateResponse response;
+  forecast.mutable_forecast()->set_horizon(3000);
+  call.stream->Write(forecast);
+  ASSERT_TRUE(call.stream->Read(&response)) << call.stream->Finish().error_message();
+  EXPECT_EQ(response.forecast().nis_size(), 3000);
+  forecast.mutable_forecast()->set_horizon(10'000);
+  call.stream->Write(forecast);
+  EXPECT_FALSE(call.stream->Read(&response));
+  EXPECT_THAT(call.stream->Finish().error_message(), ::testing::HasSubstr("can be asked for at a time, got 10000"));
+}
+
 TEST_F(EstimationServiceTest, StreamsOfALargeModelAtTheSameTimeEqualTheFilterBitForBit) {
   bundle_ = LargeStateBundle();
   Import("large", *bundle_);

@@ -33,13 +33,13 @@ nssm::Bundle MakeBundle(const v1::TrainingSpec& message, uint64_t seed) {
   return bundle;
 }
 
-v1::TrainingSpec StateSpec() {
+v1::TrainingSpec StateSpec(int32_t states) {
   v1::TrainingSpec spec;
   v1::ModelSpec& model = *spec.mutable_model();
   model.set_case_(v1::ModelSpec::STATE_INPUT_OUTPUT);
   model.set_input_size(1);
   model.set_output_size(1);
-  model.set_state_size(2);
+  model.set_state_size(states);
   model.set_latent_size(3);
   return spec;
 }
@@ -53,10 +53,10 @@ nssm::Bundle TinyBundle(uint64_t seed) {
   return MakeBundle(spec, seed);
 }
 
-nssm::Bundle TinyStateBundle() { return MakeBundle(StateSpec(), 1); }
+nssm::Bundle TinyStateBundle(int32_t states) { return MakeBundle(StateSpec(states), 1); }
 
 nssm::Bundle LargeStateBundle() {
-  v1::TrainingSpec spec = StateSpec();
+  v1::TrainingSpec spec = StateSpec(2);
   v1::ModelSpec& model = *spec.mutable_model();
   for (v1::BlockSpec* block : {model.mutable_encoder(), model.mutable_transition()->mutable_block(), model.mutable_output_decoder()}) {
     for (int layer = 0; layer < 2; ++layer) block->add_hidden_widths(128);

@@ -12,8 +12,8 @@ namespace metaekf::server {
 /// Case I: one input, one output, two latents, a window of 3, sampled every 0.1 s. Adapts with 5
 /// steps unless told otherwise.
 nssm::Bundle TinyBundle(uint64_t seed = 1);
-/// Case II: one input, one output, two states.
-nssm::Bundle TinyStateBundle();
+/// Case II: one input, one output.
+nssm::Bundle TinyStateBundle(int32_t states = 2);
 /// The same with layers so wide that sessions are stepped together.
 nssm::Bundle LargeStateBundle();
 

@@ -1,0 +1,197 @@
+// A disk that is full for a while, and one that gives back other bytes than it was given, under a running server.
+
+#include <sys/resource.h>
+
+#include <chrono>
+#include <csignal>
+#include <functional>
+
+#include "metaekf/client.h"
+#include "server/store/database.h"
+#include "tests/server/support/server_process.h"
+#include "tests/server/support/server_test.h"
+#include "tests/server/support/tiny_models.h"
+#include "tests/support/stream_signal.h"
+
+namespace metaekf::server {
+namespace {
+
+using client::Code;
+using ::testing::HasSubstr;
+
+class DiskTest : public ::testing::Test {
+ protected:
+  void SetUp() override {
+    StartServer();
+    ASSERT_TRUE(Connect().ImportModel("robot", model_).ok());
+  }
+
+  /// On the address of the first, as a supervisor would start it again.
+  void StartServer() {
+    const std::string listen = address_.empty() ? "127.0.0.1:0" : address_;
+    server_ = std::make_unique<ServerProcess>(METAEKFD_BINARY,
+                                              std::vector<std::string>{"--data-dir", directory_.path(), "--listen", listen});
+    ASSERT_NE(server_->address(), "");
+    address_ = server_->address();
+  }
+  client::Client Connect() const { return client::Client({.server = address_}); }
+
+  /// What a full disk looks like to a writer.
+  void SetFull(bool full) {
+    const rlimit limit{full ? 1000 : RLIM_INFINITY, RLIM_INFINITY};
+    ASSERT_EQ(prlimit(server_->pid(), RLIMIT_FSIZE, &limit, nullptr), 0);
+  }
+
+  std::unique_ptr<client::EstimationSession> Open(client::Client& client) {
+    client::EstimationOptions options;
+    options.target.model = "robot";
+    options.covariance = client::CovarianceFormat::kLowerTriangle;
+    auto session = client.OpenEstimation(options);
+    EXPECT_TRUE(session.ok()) << session.status().message;
+    return session.ok() ? std::move(*session) : nullptr;
+  }
+
+  /// Sends sample by sample, from `next` on, while `more` says so of each answer.
+  void Stream(client::EstimationSession& session, uint64_t* next, metaekf::testing::EstimateDigest* digest,
+              const std::function<bool(const client::EstimateBatch&)>& more) {
+    while (true) {
+      ASSERT_TRUE(session.Send(metaekf::testing::SignalSamples(0, *next, 1)).ok());
+      const auto batch = session.Receive();
+      ASSERT_TRUE(batch.ok() && batch->has_value()) << batch.status().message;
+      ASSERT_EQ((*batch)->first_seq, *next);
+      digest->Add(**batch);
+      ++*next;
+      if (!more(**batch)) return;
+    }
+  }
+
+  /// How long the oldest sample has waited to become durable.
+  double CheckpointLag() const {
+    const auto families = Connect().GetMetrics();
+    EXPECT_TRUE(families.ok()) << families.status().message;
+    for (const client::MetricFamily& family : families.ok() ? *families : std::vector<client::MetricFamily>()) {
+      if (family.name == "metaekf_checkpoint_lag_seconds") return family.metrics.at(0).value;
+    }
+    ADD_FAILURE() << "no checkpoint lag";
+    return 0;
+  }
+
+  void ExpectUndisturbed(uint64_t samples, const metaekf::testing::EstimateDigest& digest) {
+    client::Client client = Connect();
+    const auto session = Open(client);
+    ASSERT_NE(session, nullptr);
+    metaekf::testing::EstimateDigest expected;
+    uint64_t next = 1;
+    Stream(*session, &next, &expected, [&](const auto&) { return next <= samples; });
+    EXPECT_EQ(digest.value(), expected.value()) << "over " << samples << " samples";
+  }
+
+  store::TempDirectory directory_;
+  const std::string model_ = nssm::WriteModelFile(TinyStateBundle());
+  std::string address_;
+  std::unique_ptr<ServerProcess> server_;
+};
+
+TEST_F(DiskTest, AFullDiskStopsNoStreamAndPasses) {
+  client::Client client = Connect();
+  const auto session = Open(client);
+  ASSERT_NE(session, nullptr);
+  metaekf::testing::EstimateDigest digest;
+  uint64_t next = 1;
+  Stream(*session, &next, &digest, [](const auto& batch) { return batch.durable_seq == 0; });
+
+  SetFull(true);
+  const uint64_t full_since = next;
+  uint64_t durable = 0;
+  Stream(*session, &next, &digest, [&](const auto& batch) {
+    durable = batch.durable_seq;
+    return next % 100 != 0 || CheckpointLag() < 0.3;  // several commits have failed
+  });
+  EXPECT_LT(durable, full_since) << "nothing is durable that is not on the disk";
+  const auto refused = Connect().ImportModel("robot", model_);
+  ASSERT_FALSE(refused.ok());
+  EXPECT_EQ(refused.status().code, Code::kResourceExhausted);
+  EXPECT_THAT(refused.status().message, HasSubstr("make room on the data directory's disk"));
+  EXPECT_TRUE(Connect().ListModels().ok()) << "what is there is served";
+
+  SetFull(false);
+  Stream(*session, &next, &digest, [&](const auto& batch) { return batch.durable_seq < full_since; });
+  ExpectUndisturbed(next - 1, digest);
+  EXPECT_EQ(server_->End(SIGTERM).code, 0);
+}
+
+TEST_F(DiskTest, AServerKilledOnAFullDiskLosesNothing) {
+  client::Client client = Connect();
+  const auto session = Open(client);
+  ASSERT_NE(session, nullptr);
+  metaekf::testing::EstimateDigest digest;
+  uint64_t next = 1;
+  for (int round = 0; round < 3; ++round) {
+    Stream(*session, &next, &digest, [](const auto& batch) { return batch.durable_seq == 0; });
+    SetFull(true);
+    const uint64_t until = next + 300;
+    Stream(*session, &next, &digest, [&](const auto&) { return next < until; });
+    server_->End(SIGKILL);
+    StartServer();
+  }
+  const uint64_t until = next + 100;
+  Stream(*session, &next, &digest, [&](const auto&) { return next < until; });
+  ExpectUndisturbed(next - 1, digest);
+}
+
+TEST_F(DiskTest, ADamagedCheckpointIsToldAndTheOtherSessionsGoOn) {
+  client::Client client = Connect();
+  std::vector<client::SessionInfo> infos;
+  std::vector<uint64_t> next(4, 1);
+  std::vector<metaekf::testing::EstimateDigest> digests(4);
+  for (size_t s = 0; s < 4; ++s) {
+    const auto session = Open(client);
+    ASSERT_NE(session, nullptr);
+    infos.push_back(session->info());
+    Stream(*session, &next[s], &digests[s], [&](const auto&) { return next[s] <= 20; });
+    session->FinishSending();
+    ASSERT_TRUE(session->Receive().ok());
+  }
+  ASSERT_EQ(server_->End(SIGTERM).code, 0);
+
+  // Of the first a byte is another, of the second the end is missing, of the third everything.
+  const auto spoil = [](size_t session, std::string checkpoint) {
+    if (session == 0) checkpoint[checkpoint.size() / 2] ^= 1;
+    if (session == 1) checkpoint.resize(checkpoint.size() - 8);
+    if (session == 2) checkpoint = "x";
+    return checkpoint;
+  };
+  {
+    const auto database = store::Database::Open(directory_.path() + "/metaekf.db");
+    ASSERT_TRUE(database.ok()) << database.status();
+    const absl::Status spoiled = (*database)->Write([&](store::Connection& connection) -> absl::Status {
+      for (size_t s = 0; s < 3; ++s) {
+        const int64_t number = std::stoll(infos[s].session);
+        std::string checkpoint;
+        absl::Status status = connection.Execute("SELECT checkpoint FROM sessions WHERE number = ?1", {number},
+                                                 [&](const store::Row& row) { checkpoint = row.Text(0); });
+        EXPECT_FALSE(checkpoint.empty());
+        checkpoint = spoil(s, checkpoint);
+        status.Update(connection.Execute("UPDATE sessions SET checkpoint = ?2 WHERE number = ?1",
+                                         {number, store::Bytes{checkpoint}}));
+        if (!status.ok()) return status;
+      }
+      return absl::OkStatus();
+    });
+    ASSERT_TRUE(spoiled.ok()) << spoiled;
+  }
+  StartServer();
+  client = Connect();  // the connection is gone
+  for (size_t s = 0; s < 3; ++s) {
+    const auto resumed = client.ResumeEstimation(infos[s].session, infos[s].token);
+    ASSERT_FALSE(resumed.ok()) << s;
+    EXPECT_EQ(resumed.status().code, Code::kDataLoss) << resumed.status().message;
+    EXPECT_THAT(resumed.status().message, HasSubstr("checkpoint is damaged"));
+  }
+  const auto intact = client.ResumeEstimation(infos[3].session, infos[3].token);
+  ASSERT_TRUE(intact.ok()) << intact.status().message;
+  EXPECT_EQ((*intact)->durable_seq(), 20u);
+}
+
+}  // namespace
+}  // namespace metaekf::server
