@@ -282,10 +282,11 @@ Result<uint64_t> EstimationSession::Send(const SampleBatch& samples) {
     std::unique_lock lock(impl_->mutex);
     impl_->changed.wait(lock, [&] {
       const Outbox& outbox = impl_->outbox;
+      const uint64_t in_flight = outbox.sent_seq() - outbox.answered_seq();
       const bool kept_full =
           outbox.durable_seq() > 0 && outbox.sent_seq() >= outbox.oldest_seq() + impl_->max_kept;
-      return impl_->ended ||
-             (outbox.sent_seq() - outbox.answered_seq() < impl_->max_in_flight && !kept_full);
+      // What is durable is told with answers: if none is to come, waiting would be for ever.
+      return impl_->ended || in_flight == 0 || (in_flight < impl_->max_in_flight && !kept_full);
     });
     if (impl_->ended) return StreamEnded();
   }

@@ -5,6 +5,7 @@
 #include <chrono>
 #include <csignal>
 #include <functional>
+#include <thread>
 
 #include "metaekf/client.h"
 #include "server/store/database.h"
@@ -42,8 +43,9 @@ class DiskTest : public ::testing::Test {
     ASSERT_EQ(prlimit(server_->pid(), RLIMIT_FSIZE, &limit, nullptr), 0);
   }
 
-  std::unique_ptr<client::EstimationSession> Open(client::Client& client) {
+  std::unique_ptr<client::EstimationSession> Open(client::Client& client, size_t max_kept = client::EstimationOptions().max_kept) {
     client::EstimationOptions options;
+    options.max_kept = max_kept;
     options.target.model = "robot";
     options.covariance = client::CovarianceFormat::kLowerTriangle;
     auto session = client.OpenEstimation(options);
@@ -118,6 +120,29 @@ TEST_F(DiskTest, AFullDiskStopsNoStreamAndPasses) {
   Stream(*session, &next, &digest, [&](const auto& batch) { return batch.durable_seq < full_since; });
   ExpectUndisturbed(next - 1, digest);
   EXPECT_EQ(server_->End(SIGTERM).code, 0);
+}
+
+TEST_F(DiskTest, AClientThatKeepsAsMuchAsItMaySendsOn) {
+  client::Client client = Connect();
+  const auto session = Open(client, /*max_kept=*/256);
+  ASSERT_NE(session, nullptr);
+  metaekf::testing::EstimateDigest digest;
+  uint64_t next = 1;
+  Stream(*session, &next, &digest, [](const auto& batch) { return batch.durable_seq == 0; });
+  SetFull(true);  // nothing becomes durable any more
+  const uint64_t end = next + 64 * 100;
+  std::thread sender([&, seq = next]() mutable {
+    for (; seq < end; seq += 64) ASSERT_TRUE(session->Send(metaekf::testing::SignalSamples(0, seq, 64)).ok());
+  });
+  while (next < end) {
+    const auto batch = session->Receive();
+    ASSERT_TRUE(batch.ok() && batch->has_value()) << batch.status().message;
+    digest.Add(**batch);
+    next += (*batch)->samples;
+  }
+  sender.join();
+  SetFull(false);
+  ExpectUndisturbed(next - 1, digest);
 }
 
 TEST_F(DiskTest, AServerKilledOnAFullDiskLosesNothing) {

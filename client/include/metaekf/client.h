@@ -352,7 +352,8 @@ struct EstimationOptions {
   Projection projection = Projection::kDefault;
   bool stay_diverged = false;   ///< do not begin anew after a divergence
   size_t max_in_flight = 8192;  ///< samples that may wait for their answer
-  size_t max_kept = 65536;      ///< samples kept to be sent again
+  /// Samples kept to be sent again. Beyond it a batch is sent only when all before it are answered.
+  size_t max_kept = 262'144;
   double reconnect_for_s = 60;  ///< how long a stream that was lost is tried to be opened again; 0: not at all
 };
 
