@@ -6,7 +6,12 @@
 namespace metaekf::client {
 namespace {
 
+using std::chrono::steady_clock;
+using std::chrono::system_clock;
+
 constexpr std::chrono::seconds kSecondChance(2);  // of a connection, the backoff before it included
+constexpr std::chrono::milliseconds kFresh(20);   // a connection that was used within this is taken for alive
+constexpr std::chrono::milliseconds kLook(1);
 
 grpc::ChannelArguments Arguments() {
   grpc::ChannelArguments arguments;
@@ -20,6 +25,9 @@ grpc::ChannelArguments Arguments() {
   arguments.SetInt(GRPC_ARG_USE_LOCAL_SUBCHANNEL_POOL, 1);
   // A server on this machine or network is not behind the proxy that the environment may name.
   arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
+  // gRPC 1.51 repeats a call whose connection ended before it was sent, but fails its first write all the same, and all
+  // later ones: such a stream is half open for good, and waits for ever.
+  arguments.SetInt(GRPC_ARG_ENABLE_RETRIES, 0);
   arguments.SetMaxReceiveMessageSize(16 << 20);
   return arguments;
 }
@@ -81,9 +89,15 @@ Status Client::Impl::Translate(const grpc::Status& status) const {
 }
 
 void Client::Impl::Connect() const {
-  using std::chrono::system_clock;
   const auto deadline = system_clock::now() + std::chrono::microseconds(std::llround(1e6 * options.timeout_s));
   auto state = channel->GetState(true);
+  const auto now = steady_clock::now().time_since_epoch();
+  // gRPC looks at its connection while it waits for something only.
+  if (state == GRPC_CHANNEL_READY && now - last_call.load() > kFresh &&
+      channel->WaitForStateChange(state, system_clock::now() + kLook)) {
+    state = channel->GetState(true);
+  }
+  last_call = now;
   while (state == GRPC_CHANNEL_IDLE || state == GRPC_CHANNEL_CONNECTING) {
     if (!channel->WaitForStateChange(state, deadline)) return;
     state = channel->GetState(true);
@@ -98,7 +112,7 @@ void Client::Impl::Connect() const {
 }
 
 void Client::Impl::SetDeadline(grpc::ClientContext& context) const {
-  context.set_deadline(std::chrono::system_clock::now() +
+  context.set_deadline(system_clock::now() +
                        std::chrono::microseconds(std::llround(1e6 * options.timeout_s)));
 }
 

@@ -2,6 +2,7 @@
 
 #include <grpcpp/grpcpp.h>
 
+#include <atomic>
 #include <chrono>
 #include <functional>
 #include <memory>
@@ -104,13 +105,14 @@ struct Client::Impl {
   /// Shows who calls. For every call; Call does it.
   void Authorise(grpc::ClientContext& context) const;
 
-  /// Gives the channel a second chance to connect where the first failed for no good reason; whatever comes of it, the next
-  /// call says. To be called before every call: gRPC 1.51 takes some connections in the making for failed, for it looks at
-  /// the errno of connect() after other system calls.
+  /// Finds out whether a connection that was long unused is still there, and gives the channel a second chance to connect
+  /// where the first failed for no good reason; whatever comes of it, the next call says. To be called before every call:
+  /// gRPC 1.51 takes some connections in the making for failed, for it looks at the errno of connect() after other calls.
   void Connect() const;
 
   Options options;
   std::shared_ptr<grpc::Channel> channel;
+  mutable std::atomic<std::chrono::steady_clock::duration> last_call{};  // since the epoch
   std::unique_ptr<v1::ServerService::Stub> server;
   std::unique_ptr<v1::ModelService::Stub> models;
   std::unique_ptr<v1::TrainingService::Stub> training;

@@ -36,7 +36,7 @@ class StreamKillTest : public ::testing::Test {
 
   /// On the address of the first, as a supervisor would start it again.
   ServerProcess StartServer() {
-    ServerProcess server(METAEKFD_BINARY, {"--data-dir", directory_.path(), "--listen", address_});
+    ServerProcess server = ServerProcess::Metaekfd(directory_.path(), /*config=*/"", address_);
     EXPECT_EQ(server.address(), address_);
     return server;
   }

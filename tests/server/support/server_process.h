@@ -22,9 +22,10 @@ class ServerProcess {
     if (line && line->rfind(prefix, 0) == 0) address_ = line->substr(prefix.size());
   }
 
-  /// A metaekfd on a port that it picks.
-  static ServerProcess Metaekfd(const std::string& data_directory, const std::string& config = "") {
-    std::vector<std::string> arguments = {"--data-dir", data_directory, "--listen", "127.0.0.1:0"};
+  /// A metaekfd, on a port that it picks if `listen` names none.
+  static ServerProcess Metaekfd(const std::string& data_directory, const std::string& config = "",
+                                const std::string& listen = "127.0.0.1:0") {
+    std::vector<std::string> arguments = {"--data-dir", data_directory, "--listen", listen};
     if (!config.empty()) arguments.insert(arguments.end(), {"--config", config});
     return ServerProcess(METAEKFD_BINARY, arguments);
   }

@@ -1,4 +1,4 @@
-// A thousand sessions at a time: a stop loses none of them, and a restart has them back at once.
+// What clients see of a server that goes and comes back.
 
 #include <chrono>
 #include <thread>
@@ -17,7 +17,7 @@ using std::chrono::steady_clock;
 constexpr int kThreads = 8;       // each with a connection of its own
 constexpr int kPerThread = 125;
 
-class ManyStreamsTest : public ::testing::Test {
+class RestartTest : public ::testing::Test {
  protected:
   using Sessions = std::vector<std::unique_ptr<client::EstimationSession>>;
 
@@ -31,7 +31,21 @@ class ManyStreamsTest : public ::testing::Test {
   store::TempDirectory directory_;
 };
 
-TEST_F(ManyStreamsTest, AStopEndsAllSoThatNoneLosesASampleAndARestartServesAllWithinSeconds) {
+TEST_F(RestartTest, TheNextCallReachesTheNewServer) {
+  auto server = std::make_unique<ServerProcess>(ServerProcess::Metaekfd(directory_.path()));
+  const std::string address = server->address();
+  client::Client client(client::Options{.server = address});
+  for (const int signal : {SIGTERM, SIGKILL, SIGTERM, SIGKILL}) {
+    ASSERT_TRUE(client.GetServerInfo().ok());
+    server->End(signal);
+    server = std::make_unique<ServerProcess>(ServerProcess::Metaekfd(directory_.path(), /*config=*/"", address));
+    ASSERT_EQ(server->address(), address);
+    const auto info = client.GetServerInfo();
+    EXPECT_TRUE(info.ok()) << signal << ": " << info.status().message;
+  }
+}
+
+TEST_F(RestartTest, AStopEndsAThousandStreamsSoThatNoneLosesASampleAndARestartServesAllWithinSeconds) {
   auto server = std::make_unique<ServerProcess>(ServerProcess::Metaekfd(directory_.path()));
   const std::string address = server->address();
   ASSERT_NE(address, "");
@@ -72,8 +86,7 @@ TEST_F(ManyStreamsTest, AStopEndsAllSoThatNoneLosesASampleAndARestartServesAllWi
   EXPECT_LT(stopped, 10);
 
   const auto start = steady_clock::now();
-  server = std::make_unique<ServerProcess>(
-      METAEKFD_BINARY, std::vector<std::string>{"--data-dir", directory_.path(), "--listen", address});
+  server = std::make_unique<ServerProcess>(ServerProcess::Metaekfd(directory_.path(), /*config=*/"", address));
   ASSERT_EQ(server->address(), address);
   ForEachThread([&](int t) {
     for (int s = 0; s < kPerThread; ++s) {
