@@ -60,6 +60,7 @@ struct ServerOptions {
     int64_t streams_per_connection = 1024;
     int64_t model_file_bytes = int64_t{256} << 20;
     int64_t dataset_bytes = int64_t{8} << 30;
+    int64_t sample_bytes = int64_t{1} << 30;  ///< of recordings, and what is computed from them, over all calls
     int64_t samples_per_call = 16'000'000;  ///< of an adaptation or prediction
     int64_t queued_calls = 1024;
   } limits;

@@ -80,7 +80,8 @@ class Server::Parts {
                  .max_queued = Queued(),
                  .gives_way = true}),
         access(*store, [] { return absl::Now(); }, options.security),
-        context{access, *store, models, io, compute, training, jobs, options, absl::Now(), metrics, live_calls},
+        samples(options.limits.sample_bytes),
+        context{access, *store, models, io, compute, training, jobs, options, absl::Now(), metrics, live_calls, samples},
         sessions(*store, models, metrics, options.sessions.checkpoint_period),
         estimation(context, sessions) {
     metrics->AddGauges([this] {
@@ -159,6 +160,7 @@ class Server::Parts {
   BackgroundExecutor compute;
   AccessControl access;
   LiveCalls live_calls;
+  SampleBudget samples;
   const ServiceContext context;
   SessionManager sessions;
   EstimationService estimation;

@@ -116,7 +116,7 @@ class TypedFilterModel : public FilterModel {
     typed->packed.emplace(std::initializer_list<const Executable<T>*>{&with_jacobian_[kTransition], &with_jacobian_[kMeasurement], &with_jacobian_[kReconstruction]},
                           kParameters, typed->values.data(), other == nullptr ? nullptr : &*other->packed);
     std::vector<bool> unknown(typed->values.size(), false);
-    for (Eigen::Index i = 0; i < directions.rows(); ++i) unknown[static_cast<size_t>(i)] = (directions.row(i).array() != 0).any();
+    for (Eigen::Index i = 0; i < directions.rows(); ++i) unknown[static_cast<size_t>(i)] = directions.cols() > 0 && (directions.row(i).array() != 0).any();
     for (size_t function = 0; function < kFunctions; ++function) typed->known[function] = typed->packed->Without(function, unknown);
     return typed;
   }

@@ -79,4 +79,12 @@ absl::StatusOr<std::vector<Estimate>> Smooth(Ekf filter, const data::Trajectory&
   return estimates;
 }
 
+int64_t SmoothingBytesPerSample(const Ekf& filter) {
+  constexpr int64_t kAllocations = 9, kPerAllocation = 16;
+  const int64_t n = filter.process_factor().rows(), n_u = filter.input_size(), n_y = filter.output_size();
+  const int64_t width = filter.estimate_size();
+  const int64_t values = 2 * n * n + 2 * n + n_u + width * (width + 1) + n_y * (n_y + 1);
+  return static_cast<int64_t>(sizeof(Posterior) + sizeof(Estimate) + sizeof(double) * values) + kAllocations * kPerAllocation;
+}
+
 }  // namespace metaekf::filter

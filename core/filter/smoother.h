@@ -26,4 +26,7 @@ namespace metaekf::filter {
 /// Source: H. E. Rauch, F. Tung, C. T. Striebel, AIAA J. 3 (1965) 1445; the sum of squares is ours.
 absl::StatusOr<std::vector<Estimate>> Smooth(Ekf filter, const data::Trajectory& trajectory, FilterModel::Scratch* scratch);
 
+/// What Smooth takes for each sample, its result included.
+int64_t SmoothingBytesPerSample(const Ekf& filter);
+
 }  // namespace metaekf::filter

@@ -352,6 +352,7 @@ void PlainProduct(bool transpose_a, int32_t m, int32_t n, int32_t k, const T* a,
   for (int32_t j = 0; j < n; ++j) {
     T* column = c + ptrdiff_t{j} * ldc;
     if (!accumulate) std::fill_n(column, m, T(0));
+    if (k == 0) continue;  // a and b may be null
     const T* b_column = transpose_b ? b + j : b + ptrdiff_t{j} * ldb;
     if (!transpose_a) {
       for (int32_t l = 0; l < k; ++l) {

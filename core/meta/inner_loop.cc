@@ -40,7 +40,7 @@ std::vector<double> RatesOfTensors(const InnerLoopSpec& spec, const nn::Paramete
 absl::Status CheckTensorRates(const InnerLoopSpec& spec, const nn::ParameterLayout& layout) {
   for (const auto& [name, rate] : spec.tensor_rates) {
     const auto& tensors = layout.tensors();
-    if (std::any_of(tensors.begin(), tensors.end(), [&](const nn::Tensor& tensor) { return tensor.name == name; })) continue;
+    if (std::any_of(tensors.begin(), tensors.end(), [&name = name](const nn::Tensor& tensor) { return tensor.name == name; })) continue;
     return absl::InvalidArgumentError(absl::StrCat("tensor_rates: the model has no tensor \"", name, "\""));
   }
   return absl::OkStatus();

@@ -301,6 +301,7 @@ absl::StatusOr<Bundle> ReadModelFile(const std::string& bytes) {
   TakeUnits(normaliser, &spec);
   METAEKF_ASSIGN_OR_RETURN(Model model, Model::Create(spec));
   Bundle bundle{.model = std::move(model), .normaliser = std::move(normaliser)};
+  if (!fields.Has("sample_period_s")) fields.Fail("sample_period_s", "is missing");
   bundle.sample_period_s = fields.Number("sample_period_s", 0, 1e-12, 1e12);
   bundle.names.inputs = ReadNames(&fields, object, "input_names", spec.input_size);
   bundle.names.outputs = ReadNames(&fields, object, "output_names", spec.output_size);

@@ -163,6 +163,8 @@ absl::Status ApplyConfig(const std::string& text, ServerOptions* options) {
               &limits.message_bytes);
   taker.Count("limits.batch_bytes", given.has_batch_bytes(), given.batch_bytes(), kKilo,
               &limits.batch_bytes);
+  taker.Count("limits.sample_bytes", given.has_sample_bytes(), given.sample_bytes(), kKilo,
+              &limits.sample_bytes);
   taker.Count("limits.metadata_bytes", given.has_metadata_bytes(), given.metadata_bytes(), kKilo,
               &limits.metadata_bytes);
   taker.Count("limits.streams_per_connection", given.has_streams_per_connection(),

@@ -1,5 +1,6 @@
 #include "server/convert/samples.h"
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 
@@ -121,6 +122,13 @@ absl::StatusOr<std::optional<data::Trajectory>> TrajectoryAssembler::Add(
   Append(samples.outputs(), rows * static_cast<size_t>(channels.outputs), &outputs_);
   Append(samples.states(), rows * static_cast<size_t>(channels.states), &states_);
   return before;
+}
+
+int64_t TrajectoryAssembler::BytesOf(const v1::Samples& samples) const {
+  const SampleRules& rules = checker_.rules();
+  const int64_t channels = rules.channels.inputs + rules.channels.outputs + rules.channels.states;
+  const int64_t rows = std::min<int64_t>(samples.sample_count(), rules.max_samples);
+  return 2 * rows * channels * static_cast<int64_t>(sizeof(double));  // as they came, and as matrices
 }
 
 std::optional<data::Trajectory> TrajectoryAssembler::Finish() {

@@ -66,6 +66,9 @@ class TrajectoryAssembler {
   /// The last trajectory; nothing if there was none.
   std::optional<data::Trajectory> Finish();
 
+  /// What the samples of a message take here while they are put together.
+  int64_t BytesOf(const v1::Samples& samples) const;
+
   const SampleChecker& checker() const { return checker_; }
 
  private:

@@ -29,7 +29,7 @@ constexpr absl::Duration kProgressPeriod = absl::Milliseconds(50);
 
 class AdaptCall final : public StreamHandler<Request, Response> {
  public:
-  explicit AdaptCall(CallContext context) : context_(std::move(context)) {}
+  explicit AdaptCall(CallContext context) : context_(std::move(context)), share_(context_.server.samples) {}
 
   absl::Status OnRequest(Request& request, Sink&) override {
     // So that the same request_id with other options or samples is recognised.
@@ -41,6 +41,7 @@ class AdaptCall final : public StreamHandler<Request, Response> {
     if (!request.has_samples()) {
       return FieldViolation("samples", "are missing: after the options come samples only");
     }
+    METAEKF_RETURN_IF_ERROR(share_.Grow(assembler_->BytesOf(request.samples())));
     METAEKF_ASSIGN_OR_RETURN(const auto complete, assembler_->Add(request.samples()));
     if (!complete) return absl::OkStatus();
     return FieldViolation("samples.trajectory", "a second trajectory begins: the context is one");
@@ -136,6 +137,7 @@ class AdaptCall final : public StreamHandler<Request, Response> {
   std::shared_ptr<const ServedModel> model_;
   meta::AdaptationOptions options_;
   std::optional<TrajectoryAssembler> assembler_;  // once the options are there
+  SampleBudget::Share share_;
   store::Sha256 fingerprint_;
   absl::Time last_progress_;
 };

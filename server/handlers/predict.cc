@@ -37,6 +37,11 @@ class PredictCall final : public TrajectoryCall<Request, Response> {
     return absl::OkStatus();
   }
 
+  int64_t BytesPerSample() const override {
+    const nssm::ModelSpec& spec = model().bundle.model.spec();
+    return 2 * (spec.output_size + spec.state_size) * static_cast<int64_t>(sizeof(double));  // computed, and as answers
+  }
+
   absl::Status Answer(const data::Trajectory& trajectory, Sink& sink) override {
     METAEKF_RETURN_IF_ERROR(CheckStart(trajectory));
     METAEKF_ASSIGN_OR_RETURN(const nssm::Prediction prediction,

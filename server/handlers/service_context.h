@@ -3,6 +3,7 @@
 #include <memory>
 
 #include "server/access/access_control.h"
+#include "server/convert/sample_budget.h"
 #include "server/executor/background_executor.h"
 #include "server/options.h"
 #include "server/serving/model_cache.h"
@@ -28,6 +29,7 @@ struct ServiceContext {
   absl::Time start_time;
   std::shared_ptr<Metrics> metrics;
   LiveCalls& live_calls;
+  SampleBudget& samples;
 };
 
 }  // namespace metaekf::server

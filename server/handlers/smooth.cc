@@ -42,6 +42,11 @@ class SmoothCall final : public TrajectoryCall<Request, Response> {
     return absl::OkStatus();
   }
 
+  int64_t BytesPerSample() const override {
+    const int64_t width = ekf_->estimate_size();
+    return filter::SmoothingBytesPerSample(*ekf_) + width * (width + 3) * static_cast<int64_t>(sizeof(double));
+  }
+
   absl::Status Answer(const data::Trajectory& trajectory, Sink& sink) override {
     const auto scratch = model().filter_model->MakeScratch();
     const auto estimates = filter::Smooth(*ekf_, trajectory, scratch.get());

@@ -18,7 +18,8 @@ template <class Request, class Response>
 class TrajectoryCall : public StreamHandler<Request, Response> {
  public:
   /// @param method  for the audit log.
-  TrajectoryCall(CallContext context, const char* method) : context_(std::move(context)), method_(method) {}
+  TrajectoryCall(CallContext context, const char* method)
+      : context_(std::move(context)), method_(method), share_(context_.server.samples) {}
 
   absl::Status OnRequest(Request& request, ResponseSink<Response>& sink) final {
     if (!assembler_) {
@@ -28,15 +29,19 @@ class TrajectoryCall : public StreamHandler<Request, Response> {
     if (!request.has_samples()) {
       return FieldViolation("samples", "are missing: after the header come samples only");
     }
+    share_.ShrinkTo(waiting_bytes_);  // the answers to the request before are on their way
+    const int64_t bytes = assembler_->BytesOf(request.samples());
+    METAEKF_RETURN_IF_ERROR(share_.Grow(bytes));
     METAEKF_ASSIGN_OR_RETURN(const auto complete, assembler_->Add(request.samples()));
-    return complete ? Answer(*complete, sink) : absl::OkStatus();
+    waiting_bytes_ = complete ? bytes : waiting_bytes_ + bytes;
+    return complete ? WorkOn(*complete, sink) : absl::OkStatus();
   }
 
   absl::Status OnEnd(ResponseSink<Response>& sink) final {
     if (!assembler_) return FieldViolation("header", "is missing");
     const std::optional<data::Trajectory> last = assembler_->Finish();
     if (!last) return FieldViolation("samples", "there are none");
-    return Answer(*last, sink);
+    return WorkOn(*last, sink);
   }
 
  protected:
@@ -44,6 +49,8 @@ class TrajectoryCall : public StreamHandler<Request, Response> {
 
   /// What the header says beyond target and channels, which are known when this is called.
   virtual absl::Status TakeHeader(const Header& header) = 0;
+  /// What the work on a sample takes beside the sample itself, answers included until they have left.
+  virtual int64_t BytesPerSample() const = 0;
   virtual absl::Status Answer(const data::Trajectory& trajectory, ResponseSink<Response>& sink) = 0;
 
   const ServedModel& model() const { return *model_; }
@@ -62,8 +69,15 @@ class TrajectoryCall : public StreamHandler<Request, Response> {
     return absl::OkStatus();
   }
 
+  absl::Status WorkOn(const data::Trajectory& trajectory, ResponseSink<Response>& sink) {
+    METAEKF_RETURN_IF_ERROR(share_.Grow(trajectory.length() * BytesPerSample()));
+    return Answer(trajectory, sink);
+  }
+
   CallContext context_;
   const char* const method_;
+  SampleBudget::Share share_;
+  int64_t waiting_bytes_ = 0;  // of the trajectory that is not complete
   std::shared_ptr<const ServedModel> model_;
   std::optional<TrajectoryAssembler> assembler_;  // once the header is there
 };

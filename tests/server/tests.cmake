@@ -28,7 +28,7 @@ metaekf_test(server/training/resume_test.cc LABELS slow DEPS metaekf::server_tes
 metaekf_test(server/fault/kill_test.cc LABELS slow TIMEOUT 3600 DEPS metaekf::server_test_support metaekf::server_training)
 metaekf_test(server/main_test.cc DEPS metaekf::server_test_support metaekf::server_training)
 metaekf_test(server/names/resource_names_test.cc DEPS metaekf::server_names)
-foreach(test samples spec)
+foreach(test sample_budget samples spec)
   metaekf_test(server/convert/${test}_test.cc DEPS metaekf::server_convert)
 endforeach()
 metaekf_test(server/serving/model_cache_test.cc

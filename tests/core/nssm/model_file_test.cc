@@ -199,6 +199,7 @@ TEST(ModelFileTest, WhatIsMissingOrDamagedIsNamed) {
   };
   EXPECT_NE(with_metadata("\"format_version\":1", "\"format_version\":2").find("format version 2"), std::string::npos);
   EXPECT_NE(with_metadata("\"hidden_widths\":[4]", "\"hidden_widths\":[5]").find("\"encoder.0.weight\" has not the shape"), std::string::npos);
+  EXPECT_EQ(with_metadata("sample_period_s", "sample_period"), "metadata.sample_period_s: is missing");
   EXPECT_NE(with_metadata("\"measurement_cov\":[[1.0", "\"measurement_cov\":[[-1.0").find("measurement_cov"), std::string::npos);
 }
 

@@ -30,7 +30,7 @@ std::string Describe(const ServerOptions& o) {
       << " " << o.drain_timeout << " " << o.training.concurrent_jobs << " "
       << o.training.threads_per_job << " " << o.training.max_queued_jobs << " "
       << o.training.checkpoint_period << " " << o.limits.memory_bytes << " "
-      << o.limits.message_bytes << " " << o.limits.batch_bytes << " " << o.sessions.checkpoint_period << " " << o.limits.metadata_bytes << " "
+      << o.limits.message_bytes << " " << o.limits.batch_bytes << " " << o.limits.sample_bytes << " " << o.sessions.checkpoint_period << " " << o.limits.metadata_bytes << " "
       << o.limits.streams_per_connection << " " << o.limits.model_file_bytes << " "
       << o.limits.dataset_bytes << " " << o.limits.samples_per_call << " " << o.limits.queued_calls
       << " " << o.security.require_tokens << " " << o.security.max_connection_age;
@@ -65,7 +65,7 @@ TEST(ReadConfigTest, TheShippedFileShowsEveryDefault) {
   }
   ServerOptions options;
   options.listen = "nowhere";
-  options.model_cache_bytes = options.limits.message_bytes = options.limits.batch_bytes = options.limits.dataset_bytes = 1;
+  options.model_cache_bytes = options.limits.message_bytes = options.limits.batch_bytes = options.limits.sample_bytes = options.limits.dataset_bytes = 1;
   options.io_threads = options.training.max_queued_jobs = 77;
   options.security.require_tokens = true;
   options.drain_timeout = options.security.max_connection_age = options.training.checkpoint_period = options.sessions.checkpoint_period = absl::Hours(1);
@@ -91,7 +91,7 @@ TEST(ReadConfigTest, TheShippedFileShowsEveryDefault) {
   EXPECT_EQ(options.quotas.Of("works").sessions, store::Quota::kNoLimit);
   EXPECT_EQ(options.security.proxies, std::vector<std::string>{"10.0.0.5"});
   EXPECT_EQ(Describe(options), Describe(ServerOptions()));
-  EXPECT_EQ(settings, 29) << "one for every field of the message";
+  EXPECT_EQ(settings, 30) << "one for every field of the message";
 }
 
 TEST(ReadConfigTest, WhatIsLeftOutStays) {

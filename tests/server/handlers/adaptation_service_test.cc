@@ -183,8 +183,12 @@ TEST_F(AdaptationServiceTest, WrongRequestsAreRefusedWithTheField) {
 TEST_F(AdaptationServiceTest, TooManySamplesAreRefused) {
   Stop();
   options_.limits.samples_per_call = 50;
+  options_.limits.sample_bytes = 1024;
   Start();
   ExpectError(client_->Adapt(AdaptRequests(60)), absl::StatusCode::kResourceExhausted);
+  const auto reply = client_->Adapt(AdaptRequests(40));
+  ExpectError(reply, absl::StatusCode::kResourceExhausted);
+  EXPECT_NE(reply.message.find("limits.sample_bytes"), std::string::npos) << reply;
 }
 
 TEST_F(AdaptationServiceTest, ACancelledAdaptationStopsAndStoresNothing) {

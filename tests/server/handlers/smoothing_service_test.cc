@@ -61,6 +61,23 @@ TEST_F(SmoothingServiceTest, EverySampleIsAnsweredAsByCore) {
   }
 }
 
+TEST_F(SmoothingServiceTest, MoreThanTheServerHoldsIsRefused) {
+  Stop();
+  options_.limits.sample_bytes = 1 << 20;
+  Start();
+  v1::Samples samples = TinyContext(10'000);
+  const auto reply = client_->Smooth(SmoothRequests("models/robot", {samples}));
+  EXPECT_EQ(reply.code, absl::StatusCode::kResourceExhausted);
+  EXPECT_NE(reply.message.find("limits.sample_bytes"), std::string::npos) << reply.message;
+  // One after the other is no more at a time than one.
+  std::vector<v1::Samples> pieces;
+  for (int piece = 0; piece < 40; ++piece) {
+    pieces.push_back(TinyContext(500));
+    pieces.back().set_trajectory(std::to_string(piece));
+  }
+  EXPECT_TRUE(client_->Smooth(SmoothRequests("models/robot", pieces)).ok());
+}
+
 TEST_F(SmoothingServiceTest, WrongRequestsAreRefused) {
   const v1::Samples context = TinyContext(20);
   const auto status_of = [&](const std::vector<v1::SmoothRequest>& requests) { return client_->Smooth(requests); };
