@@ -41,12 +41,13 @@ class Taker {
     *target = static_cast<T>(value);
   }
 
-  void Seconds(const std::string& name, bool has, double value, absl::Duration* target) {
+  /// @param may_be_zero  which means never.
+  void Seconds(const std::string& name, bool has, double value, absl::Duration* target, bool may_be_zero = false) {
     constexpr double kDay = 86400;
     if (!has) return;
-    if (!(value > 0 && value <= kDay)) {
-      return Fail(name, absl::StrCat("is ", base::FormatExact(value),
-                                     ", must be positive and at most a day"));
+    if (!((value > 0 || (may_be_zero && value == 0)) && value <= kDay)) {
+      return Fail(name, absl::StrCat("is ", base::FormatExact(value), ", must be positive", may_be_zero ? ", or 0 for never," : "",
+                                     " and at most a day"));
     }
     *target = absl::Seconds(value);
   }
@@ -147,12 +148,8 @@ absl::Status ApplyConfig(const std::string& text, ServerOptions* options) {
   taker.Seconds("training.checkpoint_period_s", training.has_checkpoint_period_s(),
                 training.checkpoint_period_s(), &jobs.checkpoint_period);
 
-  if (config.sessions().has_checkpoint_period_s() && config.sessions().checkpoint_period_s() == 0) {
-    options->sessions.checkpoint_period = absl::ZeroDuration();
-  } else {
-    taker.Seconds("sessions.checkpoint_period_s", config.sessions().has_checkpoint_period_s(),
-                  config.sessions().checkpoint_period_s(), &options->sessions.checkpoint_period);
-  }
+  taker.Seconds("sessions.checkpoint_period_s", config.sessions().has_checkpoint_period_s(), config.sessions().checkpoint_period_s(),
+                &options->sessions.checkpoint_period, /*may_be_zero=*/true);
 
   const v1::ServerConfig::Limits& given = config.limits();
   ServerOptions::Limits& limits = options->limits;

@@ -14,6 +14,7 @@
 #include <chrono>
 #include <fstream>
 #include <functional>
+#include <optional>
 #include <thread>
 
 #include "absl/strings/numbers.h"
@@ -21,18 +22,18 @@
 #include "metaekf/client.h"
 #include "metaekf/v1/estimation.grpc.pb.h"
 #include "metaekf/v1/model.grpc.pb.h"
+#include "tests/load/neighbour.h"
 #include "tests/server/support/server_process.h"
 #include "tests/server/support/server_test.h"
 #include "tests/server/support/tiny_models.h"
 #include "tests/support/faults.h"
-#include "tests/support/stream_signal.h"
 
 namespace metaekf::server {
 namespace {
 
 using std::chrono::steady_clock;
 
-constexpr int kQuietAnswers = 500;
+constexpr ptrdiff_t kQuietAnswers = 2 * kNeighbourRound;
 
 class BombsTest : public ::testing::Test {
  protected:
@@ -42,21 +43,21 @@ class BombsTest : public ::testing::Test {
   void SetUp() override {
     ASSERT_NE(server_.address(), "");
     ASSERT_TRUE(Client(server_.address()).Import(ImportRequests("robot", nssm::WriteModelFile(TinyStateBundle()))).ok());
-    neighbour_ = std::thread([this] { BeNeighbour(); });
-    while (answers_ < kQuietAnswers && !HasFailure()) std::this_thread::yield();
+    neighbour_.emplace(METAEKF_NEIGHBOUR_BINARY, server_.address(), reconnect_for_s_);
+    ASSERT_TRUE(neighbour_->Await(static_cast<size_t>(kQuietAnswers)));
     std::ofstream(absl::StrCat("/proc/", server_.pid(), "/clear_refs")) << "5";  // the peak begins anew
     before_mb_ = PeakMb();
   }
 
   /// A neighbour has been served all the while, and the memory stayed within bounds.
   void TearDown() override {
-    done_ = true;
-    if (neighbour_.joinable()) neighbour_.join();
+    EXPECT_EQ(neighbour_->End(), 0);
     const double growth_mb = PeakMb() - before_mb_;
     EXPECT_LT(growth_mb, most_growth_mb_);
-    const auto quiet_end = latencies_ms_.begin() + std::min<ptrdiff_t>(kQuietAnswers, std::ssize(latencies_ms_));
-    const std::vector<double> quiet(latencies_ms_.begin(), quiet_end), bombed(quiet_end, latencies_ms_.end());
-    std::printf("memory %.1f MB, at most %.1f MB more; a neighbour's p99 %.2f ms, before %.2f ms (%zu and %d samples)\n", before_mb_,
+    const std::vector<double>& all = neighbour_->latencies_ms();
+    const auto quiet_end = all.begin() + std::min(kQuietAnswers, std::ssize(all));
+    const std::vector<double> quiet(all.begin(), quiet_end), bombed(quiet_end, all.end());
+    std::printf("memory %.1f MB, at most %.1f MB more; a neighbour's p99 %.2f ms, before %.2f ms (%zu and %td samples)\n", before_mb_,
                 growth_mb, Percentile99(bombed), Percentile99(quiet), bombed.size(), kQuietAnswers);
     EXPECT_EQ(server_.End(SIGTERM).code, 0);
   }
@@ -91,28 +92,6 @@ class BombsTest : public ::testing::Test {
     return 0;
   }
 
-  void BeNeighbour() {
-    client::Client client({.server = server_.address()});
-    client::EstimationOptions options;
-    options.target.model = "robot";
-    options.reconnect_for_s = reconnect_for_s_;
-    const auto session = client.OpenEstimation(options);
-    ASSERT_TRUE(session.ok()) << session.status().message;
-    Client health(server_.address());
-    for (uint64_t seq = 1; !done_; ++seq) {
-      if (reconnect_for_s_ == 0 && seq % 16 == 0) {
-        EXPECT_EQ(health.Health(), "SERVING");
-      }
-      const auto start = steady_clock::now();
-      ASSERT_TRUE((*session)->Send(metaekf::testing::SignalSamples(0, seq, 1)).ok());
-      const auto batch = (*session)->Receive();
-      ASSERT_TRUE(batch.ok()) << batch.status().message;
-      latencies_ms_.push_back(std::chrono::duration<double, std::milli>(steady_clock::now() - start).count());
-      ++answers_;
-      std::this_thread::sleep_for(std::chrono::milliseconds(1));
-    }
-  }
-
   std::shared_ptr<grpc::Channel> Channel() {
     grpc::ChannelArguments arguments;
     arguments.SetMaxSendMessageSize(-1);
@@ -124,10 +103,7 @@ class BombsTest : public ::testing::Test {
   store::TempDirectory directory_;
   ServerProcess server_;
   const double reconnect_for_s_;  // 0: its connection is not to be lost either
-  std::thread neighbour_;
-  std::atomic<bool> done_ = false;
-  std::atomic<int> answers_ = 0;
-  std::vector<double> latencies_ms_;  // the neighbour's, until it is joined
+  std::optional<Neighbour> neighbour_;
   double before_mb_ = 0;
   double most_growth_mb_ = 100;
 };
@@ -370,7 +346,7 @@ TEST_F(BombsTest, ConnectionsThatNeverSayWhatTheyWantCostLittle) {
       ASSERT_EQ(write(connection, preface.data(), bytes), static_cast<ssize_t>(bytes));
       connections.push_back(connection);
     }
-    for (const int until = answers_ + 1000; answers_ < until && !HasFailure();) std::this_thread::yield();
+    EXPECT_TRUE(neighbour_->Await(1000));
     for (const int connection : connections) close(connection);
   });
 }

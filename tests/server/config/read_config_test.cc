@@ -100,6 +100,9 @@ TEST(ReadConfigTest, WhatIsLeftOutStays) {
   ASSERT_TRUE(ApplyConfig("training { checkpoint_period_s: 2.5 }", &options).ok());
   EXPECT_EQ(options.listen, "localhost:1");
   EXPECT_EQ(options.training.checkpoint_period, absl::Seconds(2.5));
+  EXPECT_EQ(options.sessions.checkpoint_period, absl::Milliseconds(100));
+  ASSERT_TRUE(ApplyConfig("sessions { checkpoint_period_s: 0 }", &options).ok());
+  EXPECT_EQ(options.sessions.checkpoint_period, absl::ZeroDuration());
 }
 
 TEST(ReadConfigTest, ErrorsNameThePlace) {
@@ -108,6 +111,8 @@ TEST(ReadConfigTest, ErrorsNameThePlace) {
   EXPECT_THAT(Error("io_threads: 0"), HasSubstr("io_threads is 0, must be at least 1"));
   EXPECT_THAT(Error("drain_timeout_s: -1"), HasSubstr("drain_timeout_s is -1"));
   EXPECT_THAT(Error("drain_timeout_s: nan"), HasSubstr("drain_timeout_s"));
+  EXPECT_THAT(Error("drain_timeout_s: 0"), HasSubstr("drain_timeout_s is 0, must be positive"));
+  EXPECT_THAT(Error("sessions { checkpoint_period_s: -1 }"), HasSubstr("checkpoint_period_s is -1, must be positive, or 0 for never,"));
   EXPECT_THAT(Error("security { clients { tenant: 'a' scope: READ } }"),
               HasSubstr("security.clients[0]: certificate_name is missing"));
   EXPECT_THAT(Error("security { clients { certificate_name: 'a' tenant: 'A' scope: READ } }"), HasSubstr("tenant 'A'"));
