@@ -82,7 +82,9 @@ absl::StatusOr<std::shared_ptr<LiveSession>> SessionManager::Resume(store::Tenan
   METAEKF_ASSIGN_OR_RETURN(const int64_t number, ParseSessionName("resume.session", resume.session()));
   // What an earlier stream applied here need not be sent again.
   Flush();
-  METAEKF_ASSIGN_OR_RETURN(const store::Session stored, mine.sessions().Claim(number, resume.token()));
+  const absl::StatusOr<store::Session> claimed = mine.sessions().Claim(number, resume.token());
+  if (absl::IsResourceExhausted(claimed.status())) return WithRetryDelay(claimed.status(), absl::Seconds(1));  // of room on the disk
+  METAEKF_ASSIGN_OR_RETURN(const store::Session stored, claimed);
   v1::OpenSession settings;
   if (!settings.ParseFromString(stored.settings)) return absl::DataLossError("the session's settings are damaged");
   METAEKF_ASSIGN_OR_RETURN(const std::shared_ptr<const ServedModel> model, models_.Get(mine.tenant(), "target", settings.target()));

@@ -29,9 +29,8 @@ class DiskTest : public ::testing::Test {
 
   /// On the address of the first, as a supervisor would start it again.
   void StartServer() {
-    const std::string listen = address_.empty() ? "127.0.0.1:0" : address_;
-    server_ = std::make_unique<ServerProcess>(METAEKFD_BINARY,
-                                              std::vector<std::string>{"--data-dir", directory_.path(), "--listen", listen});
+    server_ = std::make_unique<ServerProcess>(
+        ServerProcess::Metaekfd(directory_.path(), /*config=*/"", address_.empty() ? "127.0.0.1:0" : address_));
     ASSERT_NE(server_->address(), "");
     address_ = server_->address();
   }
@@ -78,6 +77,19 @@ class DiskTest : public ::testing::Test {
     return 0;
   }
 
+  /// Calls that the server has refused for want of room.
+  double Refused() const {
+    double count = 0;
+    const auto families = Connect().GetMetrics();
+    EXPECT_TRUE(families.ok()) << families.status().message;
+    for (const client::MetricFamily& family : families.ok() ? *families : std::vector<client::MetricFamily>()) {
+      for (const client::Metric& metric : family.metrics) {
+        if (family.name == "metaekf_calls_total" && metric.labels.at("code") == "RESOURCE_EXHAUSTED") count += metric.value;
+      }
+    }
+    return count;
+  }
+
   void ExpectUndisturbed(uint64_t samples, const metaekf::testing::EstimateDigest& digest) {
     client::Client client = Connect();
     const auto session = Open(client);
@@ -120,6 +132,26 @@ TEST_F(DiskTest, AFullDiskStopsNoStreamAndPasses) {
   Stream(*session, &next, &digest, [&](const auto& batch) { return batch.durable_seq < full_since; });
   ExpectUndisturbed(next - 1, digest);
   EXPECT_EQ(server_->End(SIGTERM).code, 0);
+}
+
+TEST_F(DiskTest, AStreamWhoseServerComesBackToAFullDiskWaitsForRoom) {
+  client::Client client = Connect();
+  const auto session = Open(client);
+  ASSERT_NE(session, nullptr);
+  metaekf::testing::EstimateDigest digest;
+  uint64_t next = 1;
+  Stream(*session, &next, &digest, [](const auto& batch) { return batch.durable_seq == 0; });
+  server_->End(SIGKILL);
+  StartServer();
+  SetFull(true);
+  std::thread operator_([this] {
+    while (Refused() == 0 && !HasFailure()) std::this_thread::yield();
+    SetFull(false);
+  });
+  const uint64_t end = next + 100;
+  Stream(*session, &next, &digest, [&](const auto&) { return next < end; });
+  operator_.join();
+  ExpectUndisturbed(next - 1, digest);
 }
 
 TEST_F(DiskTest, AClientThatKeepsAsMuchAsItMaySendsOn) {
