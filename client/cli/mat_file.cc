@@ -80,10 +80,15 @@ absl::StatusOr<Array> ToArray(const matvar_t& array) {
   return read;
 }
 
-absl::StatusOr<std::vector<Array>> ReadArrays(mat_t* file) {
+/// @param most_values  that the file can hold: matio makes room for what the file says, before it looks what is there.
+absl::StatusOr<std::vector<Array>> ReadArrays(mat_t* file, size_t most_values) {
   std::vector<Array> arrays;
   while (const std::unique_ptr<matvar_t, Close> array{Mat_VarReadNextInfo(file)}) {
     if (array->name == nullptr || !IsSignal(*array)) continue;
+    if (array->dims[0] > most_values / std::max<size_t>(1, array->dims[1])) {
+      return absl::InvalidArgumentError(absl::StrCat("array \"", array->name, "\" says that it is ", array->dims[0], " × ", array->dims[1],
+                                                     ", more than the file can hold"));
+    }
     if (Mat_VarReadDataAll(file, array.get()) != 0) {
       return absl::InvalidArgumentError(absl::StrCat("array \"", array->name, "\" cannot be read"));
     }
@@ -184,7 +189,8 @@ absl::StatusOr<std::string> ReadMatFileAsCsv(const std::string& path) {
   if (file == nullptr) return absl::InvalidArgumentError(absl::StrCat(path, ": not a MAT file of version 5 or 7.3"));
   if (Mat_GetVersion(file.get()) == MAT_FT_MAT4) return absl::InvalidArgumentError(absl::StrCat(path, ": not a MAT file of version 5 or 7.3"));
   if (Mat_GetVersion(file.get()) == MAT_FT_MAT5) METAEKF_RETURN_IF_ERROR(base::Annotate(CheckWhole(path), path));
-  const absl::StatusOr<std::vector<Array>> arrays = ReadArrays(file.get());
+  constexpr size_t kMostOfAByte = 1032;  // that deflate makes; a value takes one byte at least
+  const absl::StatusOr<std::vector<Array>> arrays = ReadArrays(file.get(), kMostOfAByte * std::filesystem::file_size(path, error));
   if (!arrays.ok()) return base::Annotate(arrays.status(), path);
   size_t samples = 0;
   for (const Array& array : *arrays) samples = std::max({samples, array.rows, array.columns});

@@ -117,6 +117,23 @@ TEST_P(MatFileTest, AFileThatIsCutOffIsAnError) {
   EXPECT_THAT(std::string(ReadMatFileAsCsv(TempFile("part.mat", damaged)).status().message()), HasSubstr("damaged"));
 }
 
+TEST_P(MatFileTest, AnArrayLargerThanItsFileIsRefused) {
+  if (GetParam() == MAT_FT_MAT73) GTEST_SKIP() << "its sizes are HDF5's to check";
+  std::vector<double> values = {1, 2};
+  size_t dims[2] = {2, 1};
+  matvar_t* array = Mat_VarCreate("y", MAT_C_DOUBLE, MAT_T_DOUBLE, 2, dims, values.data(), 0);
+  ASSERT_EQ(Mat_VarWrite(file_, array, MAT_COMPRESSION_NONE), 0);
+  Mat_VarFree(array);
+  ASSERT_TRUE(Read().ok());
+  std::string bytes = Contents(path_);
+  const std::string sizes("\5\0\0\0\10\0\0\0\2\0\0\0\1\0\0\0", 16);
+  const size_t at = bytes.find(sizes);
+  ASSERT_NE(at, std::string::npos);
+  bytes.replace(at + 8, 8, std::string("\377\377\377\177\377\377\377\177", 8));
+  EXPECT_THAT(std::string(ReadMatFileAsCsv(TempFile("large.mat", bytes)).status().message()),
+              HasSubstr("array \"y\" says that it is 2147483647 × 2147483647, more than the file can hold"));
+}
+
 INSTANTIATE_TEST_SUITE_P(Versions, MatFileTest, ::testing::Values(MAT_FT_MAT5, MAT_FT_MAT73),
                          [](const auto& version) { return version.param == MAT_FT_MAT5 ? "V5" : "V73"; });
 
