@@ -53,7 +53,7 @@ struct ServerOptions {
   } sessions;
 
   struct Limits {
-    int64_t memory_bytes = int64_t{64} << 20;  ///< of gRPC's buffers
+    int64_t memory_bytes = int64_t{48} << 20;  ///< of gRPC's buffers
     int64_t message_bytes = int64_t{4} << 20;
     int64_t batch_bytes = int64_t{16} << 20;  ///< of batches and answers that streams hold
     int64_t metadata_bytes = int64_t{16} << 10;
