@@ -10,7 +10,7 @@ using std::chrono::steady_clock;
 using std::chrono::system_clock;
 
 constexpr std::chrono::seconds kSecondChance(2);  // of a connection, the backoff before it included
-constexpr std::chrono::milliseconds kFresh(20);   // a connection that was used within this is taken for alive
+constexpr std::chrono::milliseconds kFresh(5);    // no server is restarted within this: a connection is taken for alive
 constexpr std::chrono::milliseconds kLook(1);
 
 grpc::ChannelArguments Arguments() {

@@ -44,16 +44,23 @@ struct Client::Impl {
   /// `status`, of a call that was not cancelled here, in the library's terms; errors of the connection say what to look at.
   Status Translate(const grpc::Status& status) const;
 
-  /// One request, one response, within the time limit.
+  /// One request, one response, within the time limit; what only asks is asked again if its connection was lost, as that of a
+  /// server that was restarted a moment ago.
   template <typename Service, typename Request, typename Response>
   Status Call(const std::unique_ptr<Service>& service,
               grpc::Status (Service::*method)(grpc::ClientContext*, const Request&, Response*),
               const Request& request, Response* response) const {
-    Connect();
-    grpc::ClientContext context;
-    SetDeadline(context);
-    Authorise(context);
-    return Translate((service.get()->*method)(&context, request, response));
+    const auto call = [&] {
+      Connect();
+      grpc::ClientContext context;
+      SetDeadline(context);
+      Authorise(context);
+      return Translate((service.get()->*method)(&context, request, response));
+    };
+    const std::string& name = Request::descriptor()->name();
+    const bool asks = name.rfind("Get", 0) == 0 || name.rfind("List", 0) == 0;
+    const Status status = call();
+    return status.reason == "CONNECTION_LOST" && asks ? call() : status;
   }
 
   /// All pages of a list. `items` gives the repeated field of a page.
