@@ -59,7 +59,7 @@ template <typename T>
 void RunPacked(const Instruction& i, const Places<T>& at, const T* factor) {
   const bool add = i.op == Opcode::kMatMulAdd;
   if (add) CopyAddend(i, at);
-  linalg::PackedMatMul(i.rows, i.cols, i.inner, factor, at.b, i.b.ld, at.out, i.out.ld, add);
+  linalg::PackedMatMul(!i.transpose_a, i.rows, i.cols, i.inner, factor, at.b, i.b.ld, at.out, i.out.ld, add);
 }
 
 /// The products of several runs with one factor, as one.
@@ -71,7 +71,7 @@ void RunPackedTogether(const Instruction& i, std::span<const Places<T>> runs, co
   for (const Places<T>& at : runs) {
     for (int64_t j = 0; j < i.cols; ++j, to += i.inner) std::copy_n(at.b + j * i.b.ld, i.inner, to);
   }
-  linalg::PackedMatMul(i.rows, static_cast<int32_t>(columns), i.inner, factor, gathered, i.inner, results, i.rows, false);
+  linalg::PackedMatMul(!i.transpose_a, i.rows, static_cast<int32_t>(columns), i.inner, factor, gathered, i.inner, results, i.rows, false);
   const T* from = results;
   for (const Places<T>& at : runs) {
     const bool add = i.op == Opcode::kMatMulAdd;

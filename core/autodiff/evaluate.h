@@ -108,7 +108,7 @@ class Slots {
   std::array<T*, kMaxSlots> pointers_{};
 };
 
-/// For each instruction of an executable its first factor as linalg::Pack lays it out, or null: it is read where it lies.
+/// For each instruction of an executable its first factor, transposed, as linalg::Pack lays it out, or null: it is read where it lies.
 template <typename T>
 using Packed = std::vector<const T*>;
 

@@ -17,7 +17,7 @@ bool IsPackable(const Instruction& i, int32_t slot) {
 
 template <typename T>
 typename PackedWeights<T>::Key PackedWeights<T>::KeyOf(const Instruction& i) {
-  return {i.a.offset, i.a.ld, i.transpose_a ? i.inner : i.rows, i.transpose_a ? i.rows : i.inner, i.transpose_a};
+  return {i.a.offset, i.a.ld, i.transpose_a ? i.inner : i.rows, i.transpose_a ? i.rows : i.inner};
 }
 
 template <typename T>
@@ -30,11 +30,13 @@ PackedWeights<T>::PackedWeights(std::initializer_list<const Executable<T>*> user
         of_user.push_back(nullptr);
         continue;
       }
-      Buffer& factor = factors_[KeyOf(i)];
-      if (factor == nullptr) factor = Find(KeyOf(i), like);
+      const Key key = KeyOf(i);
+      Buffer& factor = factors_[key];
+      if (factor == nullptr) factor = Find(key, like);
       if (factor == nullptr) {
-        auto made = std::make_shared<AlignedBuffer<T>>(linalg::PackedSize(i.rows, i.inner));
-        linalg::Pack(i.transpose_a, i.rows, i.inner, weights + i.a.offset, i.a.ld, made->data());
+        const auto [offset, ld, rows, columns] = key;
+        auto made = std::make_shared<AlignedBuffer<T>>(linalg::PackedSize(columns, rows));
+        linalg::Pack(true, columns, rows, weights + offset, ld, made->data());
         factor = std::move(made);
       }
       of_user.push_back(factor->data());
@@ -48,7 +50,7 @@ typename PackedWeights<T>::Buffer PackedWeights<T>::Find(const Key& key, const P
   if (like == nullptr) return nullptr;
   const auto found = like->factors_.find(key);
   if (found == like->factors_.end()) return nullptr;
-  const auto [offset, ld, rows, columns, transposed] = key;
+  const auto [offset, ld, rows, columns] = key;
   for (int64_t column = 0; column < columns; ++column) {
     const int64_t at = offset + column * ld;
     if (std::memcmp(weights_ + at, like->weights_ + at, sizeof(T) * static_cast<size_t>(rows)) != 0) return nullptr;
@@ -61,7 +63,7 @@ Packed<T> PackedWeights<T>::Without(size_t user, const std::vector<bool>& change
   Packed<T> kept = packed_[user];
   for (size_t k = 0; k < kept.size(); ++k) {
     if (kept[k] == nullptr) continue;
-    const auto [offset, ld, rows, columns, transposed] = KeyOf(users_[user]->program().instructions[k]);
+    const auto [offset, ld, rows, columns] = KeyOf(users_[user]->program().instructions[k]);
     for (int64_t e = 0; e < int64_t{rows} * columns; ++e) {
       if (changed[static_cast<size_t>(offset + e / rows * ld + e % rows)]) kept[k] = nullptr;
     }

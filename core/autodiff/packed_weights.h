@@ -11,7 +11,8 @@
 
 namespace metaekf::autodiff {
 
-/// Large factors of products as linalg::Pack lays them out, of weights that many runs of a few executables read. Immutable.
+/// Large factors of products as linalg::Pack lays them out, of weights that many runs of a few executables read: their transposes, which a
+/// layer multiplies with. Immutable.
 template <typename T>
 class PackedWeights {
  public:
@@ -27,8 +28,8 @@ class PackedWeights {
   Packed<T> Without(size_t user, const std::vector<bool>& changed) const;
 
  private:
-  /// offset in the slot, ld, rows and columns as they lie, transposed or not
-  using Key = std::tuple<int64_t, int32_t, int32_t, int32_t, bool>;
+  /// offset in the slot, ld, rows and columns
+  using Key = std::tuple<int64_t, int32_t, int32_t, int32_t>;
   using Buffer = std::shared_ptr<const AlignedBuffer<T>>;
   static Key KeyOf(const Instruction& i);
   Buffer Find(const Key& key, const PackedWeights* like) const;

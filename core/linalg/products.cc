@@ -21,6 +21,8 @@
 #include <hwy/foreach_target.h>
 #include <hwy/highway.h>
 
+#include "core/linalg/lane_sums-inl.h"
+
 HWY_BEFORE_NAMESPACE();
 namespace metaekf::linalg {
 namespace HWY_NAMESPACE {
@@ -28,11 +30,11 @@ namespace hn = hwy::HWY_NAMESPACE;
 
 // Tiles fill the registers: 32 of them with AVX-512, 16 otherwise.
 constexpr bool kManyRegisters = HWY_TARGET <= HWY_AVX3;
-constexpr int kTileVectors = kManyRegisters ? 3 : 2;
-constexpr int kTileColumns = kManyRegisters ? 8 : 6;
+constexpr int kTileVectors = kManyRegisters ? 4 : 2;
+constexpr int kTileColumns = 6;
 constexpr int kDotRows = kManyRegisters ? 4 : 2;
 constexpr int kDotColumns = 4;
-constexpr int kDepth = 256;
+constexpr int kDepth = kManyRegisters ? 128 : 256;  // a panel leaves a third of a first-level cache free
 constexpr int kCopyFromTiles = 4;  // tiles of a strip from which on a copy of it pays
 constexpr int kDotMaxColumns = 12;
 constexpr int kDotMinDepthVectors = 4;
@@ -115,6 +117,47 @@ HWY_INLINE void Strip(D d, int rows, int columns, int k, const T* a, ptrdiff_t l
   }
 }
 
+/// Copies a vector of each of four rows so that their elements of each column lie side by side.
+template <class D, typename T = hn::TFromD<D>>
+HWY_INLINE void CopyFours(D d, const T* HWY_RESTRICT from, ptrdiff_t by_row, T* HWY_RESTRICT to, int ld) {
+  const auto row = [&](int i) HWY_ATTR { return hn::LoadU(d, from + i * by_row); };
+#if HWY_TARGET == HWY_SCALAR
+  (void)ld;
+  for (int i = 0; i < 4; ++i) hn::StoreU(row(i), d, to + i);
+#else
+  // Interleaved within their blocks of 16 bytes; a block then holds what goes into one column, or half of it.
+  constexpr int kBlock = 16 / sizeof(T);
+  const int lanes = static_cast<int>(hn::Lanes(d));
+  HWY_ALIGN T blocks[4 * hn::MaxLanes(D())];
+  const auto low01 = hn::InterleaveLower(d, row(0), row(1)), high01 = hn::InterleaveUpper(d, row(0), row(1));
+  const auto low23 = hn::InterleaveLower(d, row(2), row(3)), high23 = hn::InterleaveUpper(d, row(2), row(3));
+  if constexpr (sizeof(T) == 4) {
+    const hn::Repartition<double, D> wide;
+    const auto pairs = [&](int column, auto v01, auto v23) HWY_ATTR {
+      const auto w01 = hn::BitCast(wide, v01), w23 = hn::BitCast(wide, v23);
+      hn::Store(hn::BitCast(d, hn::InterleaveLower(wide, w01, w23)), d, blocks + column * lanes);
+      hn::Store(hn::BitCast(d, hn::InterleaveUpper(wide, w01, w23)), d, blocks + (column + 1) * lanes);
+    };
+    pairs(0, low01, low23);
+    pairs(2, high01, high23);
+    for (int first = 0; first < lanes; first += kBlock) {
+      for (int column = 0; column < kBlock; ++column) std::memcpy(to + (first + column) * ld, blocks + column * lanes + first, 16);
+    }
+  } else {
+    hn::Store(low01, d, blocks);
+    hn::Store(high01, d, blocks + lanes);
+    hn::Store(low23, d, blocks + 2 * lanes);
+    hn::Store(high23, d, blocks + 3 * lanes);
+    for (int first = 0; first < lanes; first += kBlock) {
+      for (int column = 0; column < kBlock; ++column) {
+        std::memcpy(to + (first + column) * ld, blocks + column * lanes + first, 16);
+        std::memcpy(to + (first + column) * ld + kBlock, blocks + (2 + column) * lanes + first, 16);
+      }
+    }
+  }
+#endif
+}
+
 /// Copies `rows` × k of op(A) to a panel of `height` rows, with zeros below.
 template <class D, typename T = hn::TFromD<D>>
 HWY_INLINE void CopyPanel(D d, int rows, int height, int k, Strided<T> a, T* HWY_RESTRICT panel) {
@@ -125,18 +168,12 @@ HWY_INLINE void CopyPanel(D d, int rows, int height, int k, Strided<T> a, T* HWY
       for (int l = 0; l < k; ++l) hn::Store(hn::LoadU(d, a.at + i + l * a.by_column), d, panel + i + l * height);
     }
   } else {
-    // Four rows at a time: interleaved, they are the fours of each column.
-    const hn::CappedTag<T, 4> narrow;
-    const int width = static_cast<int>(hn::Lanes(narrow));
-    HWY_ALIGN T fours[16];
+    const hn::ScalableTag<T> whole;
+    const int width = static_cast<int>(hn::Lanes(whole));
     for (; i + 4 <= rows; i += 4) {
       const T* row = a.at + i * a.by_row;
       int l = 0;
-      for (; l + width <= k; l += width) {
-        hn::StoreInterleaved4(hn::LoadU(narrow, row + l), hn::LoadU(narrow, row + a.by_row + l),
-                              hn::LoadU(narrow, row + 2 * a.by_row + l), hn::LoadU(narrow, row + 3 * a.by_row + l), narrow, fours);
-        for (int j = 0; j < width; ++j) std::memcpy(panel + i + (l + j) * height, fours + 4 * j, 4 * sizeof(T));
-      }
+      for (; l + width <= k; l += width) CopyFours(whole, row + l, a.by_row, panel + i + l * height, height);
       for (; l < k; ++l) {
         for (int j = 0; j < 4; ++j) panel[i + j + l * height] = row[j * a.by_row + l];
       }
@@ -169,6 +206,9 @@ void Panels(D d, int m, int n, int k, Strided<T> a, Strided<T> b, Target<T> c) {
     };
     int row = 0;
     for (; row + height <= m; row += height) strip(d, std::integral_constant<int, kTileVectors>(), row, height);
+    if constexpr (kTileVectors > 2) {
+      for (; row + 2 * lanes <= m; row += 2 * lanes) strip(d, std::integral_constant<int, 2>(), row, 2 * lanes);
+    }
     for (; row + lanes <= m; row += lanes) strip(d, std::integral_constant<int, 1>(), row, lanes);
     if (row == m) continue;
     const hn::CappedTag<T, std::max<size_t>(hn::MaxLanes(D()) / 2, 1)> half;
@@ -182,38 +222,6 @@ void Panels(D d, int m, int n, int k, Strided<T> a, Strided<T> b, Target<T> c) {
       strip(d, std::integral_constant<int, 1>(), row, m - row);
     }
   }
-}
-
-/// The sums over the lanes of four vectors.
-template <class D, typename T = hn::TFromD<D>>
-HWY_INLINE void Sums(D d, const hn::Vec<D>* v, T* sums) {
-#if HWY_TARGET == HWY_SCALAR
-  METAEKF_UNROLL
-  for (int i = 0; i < 4; ++i) sums[i] = hn::GetLane(v[i]);
-  (void)d;
-#else
-  // Pairs of vectors are folded within their blocks of 16 bytes until one block holds a lane of each; blocks are added last.
-  const hn::CappedTag<T, 16 / sizeof(T)> block;
-  const int lanes = static_cast<int>(hn::Lanes(d)), step = static_cast<int>(hn::Lanes(block));
-  HWY_ALIGN T folded[2 * hn::MaxLanes(D())];
-  const auto t0 = hn::Add(hn::InterleaveLower(d, v[0], v[1]), hn::InterleaveUpper(d, v[0], v[1]));
-  const auto t1 = hn::Add(hn::InterleaveLower(d, v[2], v[3]), hn::InterleaveUpper(d, v[2], v[3]));
-  int vectors = 2;
-  if constexpr (sizeof(T) == 4) {
-    const hn::Repartition<double, D> wide;
-    const auto w0 = hn::BitCast(wide, t0), w1 = hn::BitCast(wide, t1);
-    hn::Store(hn::Add(hn::BitCast(d, hn::InterleaveLower(wide, w0, w1)), hn::BitCast(d, hn::InterleaveUpper(wide, w0, w1))), d, folded);
-    vectors = 1;
-  } else {
-    hn::Store(t0, d, folded);
-    hn::Store(t1, d, folded + lanes);
-  }
-  for (int i = 0; i < vectors; ++i) {
-    auto sum = hn::Load(block, folded + i * lanes);
-    for (int j = step; j < lanes; j += step) sum = hn::Add(sum, hn::Load(block, folded + i * lanes + j));
-    hn::StoreU(sum, block, sums + i * step);
-  }
-#endif
 }
 
 /// kRows rows and kColumns columns of C = AᵀB.

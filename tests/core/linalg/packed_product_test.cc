@@ -23,13 +23,13 @@ std::vector<T> Random(int64_t size, base::Rng* rng) {
   return values;
 }
 
-/// op(A) as PackedMatMul reads it: aligned, and as large as it says, so that a sanitizer sees whoever reads past it.
+/// A matrix as PackedMatMul reads it: aligned, and as large as it says, so that a sanitizer sees whoever reads past it.
 template <typename T>
 class PackedMatrix {
  public:
-  PackedMatrix(bool transpose, int32_t m, int32_t k, const std::vector<T>& a, int32_t lda)
-      : memory_(static_cast<T*>(::operator new[](sizeof(T) * static_cast<size_t>(PackedSize(m, k)), std::align_val_t(128)))) {
-    Pack(transpose, m, k, a.data(), lda, memory_.get());
+  PackedMatrix(bool transpose, int32_t rows, int32_t columns, const std::vector<T>& a, int32_t lda)
+      : memory_(static_cast<T*>(::operator new[](sizeof(T) * static_cast<size_t>(PackedSize(rows, columns)), std::align_val_t(128)))) {
+    Pack(transpose, rows, columns, a.data(), lda, memory_.get());
   }
   const T* data() const { return memory_.get(); }
 
@@ -46,16 +46,16 @@ void CheckSumsAndThatColumnsDoNotMatter() {
   const auto size = [&rng](int32_t most) { return 1 + static_cast<int32_t>(rng.Index(static_cast<size_t>(most))); };
   for (int trial = 0; trial < 200; ++trial) {
     const int32_t m = size(trial % 2 == 0 ? 150 : 20), k = size(trial % 3 == 0 ? 300 : 20), n = size(34), gap = trial % 3;
-    const bool transpose = rng.Uniform(0, 1) < 0.5, accumulate = rng.Uniform(0, 1) < 0.5;
+    const bool transpose = rng.Uniform(0, 1) < 0.5, turned = rng.Uniform(0, 1) < 0.5, accumulate = rng.Uniform(0, 1) < 0.5;
     const int32_t lda = (transpose ? k : m) + gap, ldb = k + gap, ldc = m + gap;
     const std::vector<T> a = Random<T>(int64_t{lda} * (transpose ? m : k), &rng), b = Random<T>(int64_t{ldb} * n - gap, &rng),
                          before = Random<T>(int64_t{ldc} * n - gap, &rng);
-    const PackedMatrix<T> packed(transpose, m, k, a, lda);
+    const PackedMatrix<T> packed(transpose != turned, turned ? k : m, turned ? m : k, a, lda);
     std::vector<T> c = before;
-    PackedMatMul(m, n, k, packed.data(), b.data(), ldb, c.data(), ldc, accumulate);
+    PackedMatMul(turned, m, n, k, packed.data(), b.data(), ldb, c.data(), ldc, accumulate);
     for (int32_t j = 0; j < n; ++j) {
       std::vector<T> alone(before.begin() + j * ldc, before.begin() + j * ldc + m);
-      PackedMatMul(m, 1, k, packed.data(), b.data() + j * ldb, ldb, alone.data(), m, accumulate);
+      PackedMatMul(turned, m, 1, k, packed.data(), b.data() + j * ldb, ldb, alone.data(), m, accumulate);
       for (int32_t i = 0; i < m; ++i) {
         const auto at = static_cast<size_t>(i + j * ldc);
         double sum = accumulate ? static_cast<double>(before[at]) : 0, terms = std::fabs(sum);
