@@ -9,6 +9,7 @@
 
 #include "absl/strings/str_cat.h"
 #include "core/base/status.h"
+#include "server/executor/give_way.h"
 #include "server/handlers/overload.h"
 #include "server/handlers/unary_call.h"
 #include "server/metrics/metrics.h"
@@ -371,6 +372,7 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
 
   EstimationService& service_;
   grpc::CallbackServerContext* const context_;
+  const FreeProcessor free_processor_;
   const std::shared_ptr<CallRecord> record_;
   const Caller caller_;  // and not what its tenant has: streams are many, and need it once
   SampleRate* const rate_;  // of its tenant; null: as fast as it likes

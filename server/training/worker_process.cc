@@ -13,6 +13,7 @@
 
 #include "absl/strings/str_cat.h"
 #include "absl/time/clock.h"
+#include "server/executor/give_way.h"
 
 extern char** environ;
 
@@ -73,6 +74,7 @@ absl::StatusOr<WorkerProcess> WorkerProcess::Start(const std::string& binary,
   const int error = posix_spawn(&pid, binary.c_str(), settings.actions(), settings.attributes(),
                                 argv.data(), environ);
   if (error != 0) return store::ErrnoStatus(error, absl::StrCat("cannot start ", binary));
+  AddBatchProcess(pid);
   return WorkerProcess(pid, std::move(output));
 }
 
@@ -116,6 +118,7 @@ WorkerProcess::Exit WorkerProcess::Wait() {
   int status = 0;
   while (waitpid(pid_, &status, 0) < 0 && errno == EINTR) {
   }
+  RemoveBatchProcess(pid_);
   pid_ = 0;
   if (WIFSIGNALED(status)) return {0, WTERMSIG(status)};
   return {WEXITSTATUS(status), 0};

@@ -34,6 +34,7 @@ endforeach()
 metaekf_test(server/serving/model_cache_test.cc
   DEPS metaekf::server_serving metaekf::server_test_support)
 metaekf_test(server/executor/background_executor_test.cc DEPS metaekf::server_executor)
+metaekf_test(server/executor/give_way_test.cc DEPS metaekf::server_executor)
 metaekf_test(server/training/job_feed_test.cc DEPS metaekf::server_training)
 metaekf_test(server/config/read_config_test.cc
   DEPS metaekf::server_config metaekf::server_store)
