@@ -159,7 +159,8 @@ int RunWorker(const WorkerOptions& options) {
   ProgressReporter reporter;
   const absl::Status status = Attempt(options, reporter).Run();
   if (status.ok()) return kWorkerDone;
-  if (absl::IsCancelled(status)) return kWorkerStopped;
+  // The work directory goes with a job that is cancelled.
+  if (absl::IsCancelled(status) || (stop_requested && absl::IsNotFound(status))) return kWorkerStopped;
   spdlog::error("{}", status.ToString());
   reporter.Error(std::string(status.message()));
   // What the machine lacks now it may have later.

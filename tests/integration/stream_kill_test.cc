@@ -1,9 +1,11 @@
-// kill -9 of the server under streams, at seeded moments: the client library goes on by itself; no estimate is missed, none
+// What happens to the server under streams, at seeded moments: the client library goes on by itself; no estimate is missed, none
 // comes twice, and all are those of a stream that nobody disturbed, bit for bit.
 //
 // METAEKF_FAULTS=long: 1,000 times instead of 50.
 
 #include <atomic>
+#include <functional>
+#include <optional>
 #include <thread>
 
 #include "core/base/rng.h"
@@ -70,56 +72,79 @@ class StreamKillTest : public ::testing::Test {
     }
   }
 
+  /// Streams to a server that is disturbed so often, and compares with what a server says that is not.
+  void CheckUnder(int times, const std::function<void()>& disturb) {
+    std::vector<Estimates> estimates(kStreams);
+    server_.emplace(StartServer());
+    {
+      std::vector<client::Client> clients;
+      std::vector<std::unique_ptr<client::EstimationSession>> sessions;
+      for (int s = 0; s < kStreams; ++s) {
+        clients.emplace_back(client::Options{.server = address_});
+        sessions.push_back(Open(clients.back()));
+        ASSERT_NE(sessions.back(), nullptr);
+      }
+      std::vector<std::thread> threads;
+      for (int s = 0; s < kStreams; ++s) {
+        threads.emplace_back([&, s] { Stream(*sessions[static_cast<size_t>(s)], s, 0, &estimates[static_cast<size_t>(s)]); });
+      }
+      for (int time = 0; time < times && !HasFailure(); ++time) {
+        // Some before a stream has got anywhere, some in the midst of checkpoints.
+        const uint64_t until = received_ + rng_.Index(2) * (1 + rng_.Index(3000)) + rng_.Index(20);
+        while (received_ < until && !HasFailure()) std::this_thread::yield();
+        disturb();
+      }
+      stop_ = true;
+      for (std::thread& thread : threads) thread.join();
+    }
+    server_->End(SIGKILL);
+
+    server_.emplace(StartServer());
+    client::Client client({.server = address_});
+    for (int s = 0; s < kStreams && !HasFailure(); ++s) {
+      const Estimates& disturbed = estimates[static_cast<size_t>(s)];
+      const auto session = Open(client);
+      ASSERT_NE(session, nullptr);
+      const size_t per_sample = session->info().estimate_size * (session->info().estimate_size + 3) / 2;
+      ASSERT_GT(disturbed.size(), 0u);
+      Estimates reference;
+      Stream(*session, s, disturbed.size() / per_sample, &reference);
+      ASSERT_EQ(reference.size(), disturbed.size());
+      for (size_t i = 0; i < reference.size(); ++i) {
+        ASSERT_EQ(reference[i], disturbed[i]) << "stream " << s << " sample " << i / per_sample + 1;
+      }
+    }
+    RecordProperty("samples", std::to_string(received_));
+  }
+
   store::TempDirectory directory_;
   std::string address_;
+  base::Rng rng_{11};
+  std::optional<ServerProcess> server_;
   std::atomic<bool> stop_ = false;
   std::atomic<uint64_t> received_ = 0;
 };
 
 TEST_F(StreamKillTest, NoSampleIsLostOrAppliedTwice) {
-  const int kills = metaekf::testing::LongFaults() ? 1000 : 50;
-  base::Rng rng(11);
-  std::vector<Estimates> estimates(kStreams);
-  {
-    auto server = std::make_unique<ServerProcess>(StartServer());
-    std::vector<client::Client> clients;
-    std::vector<std::unique_ptr<client::EstimationSession>> sessions;
-    for (int s = 0; s < kStreams; ++s) {
-      clients.emplace_back(client::Options{.server = address_});
-      sessions.push_back(Open(clients.back()));
-      ASSERT_NE(sessions.back(), nullptr);
-    }
-    std::vector<std::thread> threads;
-    for (int s = 0; s < kStreams; ++s) {
-      threads.emplace_back([&, s] { Stream(*sessions[static_cast<size_t>(s)], s, 0, &estimates[static_cast<size_t>(s)]); });
-    }
-    for (int kill = 0; kill < kills && !HasFailure(); ++kill) {
-      // Some before a stream has got anywhere, some in the midst of checkpoints.
-      const uint64_t until = received_ + rng.Index(2) * (1 + rng.Index(3000)) + rng.Index(20);
-      while (received_ < until && !HasFailure()) std::this_thread::yield();
-      EXPECT_EQ(server->End(SIGKILL).signal, SIGKILL);
-      server = std::make_unique<ServerProcess>(StartServer());
-    }
-    stop_ = true;
-    for (std::thread& thread : threads) thread.join();
-  }
+  CheckUnder(metaekf::testing::LongFaults() ? 1000 : 50, [this] {
+    EXPECT_EQ(server_->End(SIGKILL).signal, SIGKILL);
+    server_.emplace(StartServer());
+  });
+}
 
-  ServerProcess undisturbed = StartServer();
-  client::Client client({.server = address_});
-  for (int s = 0; s < kStreams && !HasFailure(); ++s) {
-    const Estimates& disturbed = estimates[static_cast<size_t>(s)];
-    const auto session = Open(client);
-    ASSERT_NE(session, nullptr);
-    const size_t per_sample = session->info().estimate_size * (session->info().estimate_size + 3) / 2;
-    ASSERT_GT(disturbed.size(), 0u);
-    Estimates reference;
-    Stream(*session, s, disturbed.size() / per_sample, &reference);
-    ASSERT_EQ(reference.size(), disturbed.size());
-    for (size_t i = 0; i < reference.size(); ++i) {
-      ASSERT_EQ(reference[i], disturbed[i]) << "stream " << s << " sample " << i / per_sample + 1;
+// One that stands still may go on at any time, and would then write beside the other.
+TEST_F(StreamKillTest, AServerThatStandsStillIsTakenOverFromOnceItIsDead) {
+  int round = 0;
+  CheckUnder(6, [&] {
+    kill(server_->pid(), SIGSTOP);
+    EXPECT_EQ(ServerProcess::Metaekfd(directory_.path()).address(), "") << "a second server on the directory";
+    if (++round % 2 == 0) {
+      kill(server_->pid(), SIGCONT);
+      return;
     }
-  }
-  RecordProperty("samples", std::to_string(received_));
+    EXPECT_EQ(server_->End(SIGKILL).signal, SIGKILL);
+    server_.emplace(StartServer());
+  });
 }
 
 }  // namespace
