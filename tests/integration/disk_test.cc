@@ -9,6 +9,7 @@
 
 #include "metaekf/client.h"
 #include "server/store/database.h"
+#include "tests/server/support/metric.h"
 #include "tests/server/support/server_process.h"
 #include "tests/server/support/server_test.h"
 #include "tests/server/support/tiny_models.h"
@@ -67,28 +68,9 @@ class DiskTest : public ::testing::Test {
   }
 
   /// How long the oldest sample has waited to become durable.
-  double CheckpointLag() const {
-    const auto families = Connect().GetMetrics();
-    EXPECT_TRUE(families.ok()) << families.status().message;
-    for (const client::MetricFamily& family : families.ok() ? *families : std::vector<client::MetricFamily>()) {
-      if (family.name == "metaekf_checkpoint_lag_seconds") return family.metrics.at(0).value;
-    }
-    ADD_FAILURE() << "no checkpoint lag";
-    return 0;
-  }
-
+  double CheckpointLag() const { return Metric(address_, "metaekf_checkpoint_lag_seconds"); }
   /// Calls that the server has refused for want of room.
-  double Refused() const {
-    double count = 0;
-    const auto families = Connect().GetMetrics();
-    EXPECT_TRUE(families.ok()) << families.status().message;
-    for (const client::MetricFamily& family : families.ok() ? *families : std::vector<client::MetricFamily>()) {
-      for (const client::Metric& metric : family.metrics) {
-        if (family.name == "metaekf_calls_total" && metric.labels.at("code") == "RESOURCE_EXHAUSTED") count += metric.value;
-      }
-    }
-    return count;
-  }
+  double Refused() const { return Metric(address_, "metaekf_calls_total", {{"code", "RESOURCE_EXHAUSTED"}}); }
 
   void ExpectUndisturbed(uint64_t samples, const metaekf::testing::EstimateDigest& digest) {
     client::Client client = Connect();
