@@ -174,15 +174,14 @@ void TransposedTile(D d, const PackedProductOf<T>& p, int row, int column) {
   }
 }
 
-template <int kRows, int kColumns, class D, typename T = hn::TFromD<D>>
-HWY_INLINE void TransposedColumns(D d, const PackedProductOf<T>& p, int n, int row) {
+/// kRows rows of C = AᵀB from `row` on.
+template <int kRows, class D, typename T = hn::TFromD<D>>
+HWY_INLINE void TransposedRows(D d, const PackedProductOf<T>& p, int n, int row) {
   int column = 0;
-  for (; column + kColumns <= n; column += kColumns) TransposedTile<kRows, kColumns>(d, p, row, column);
-  if constexpr (kColumns > 1) {
-    if (n - column == 3) return TransposedTile<kRows, 3>(d, p, row, column);
-    if (n - column == 2) return TransposedTile<kRows, 2>(d, p, row, column);
-    if (n - column == 1) return TransposedTile<kRows, 1>(d, p, row, column);
-  }
+  for (; column + 4 <= n; column += 4) TransposedTile<kRows, 4>(d, p, row, column);
+  if (n - column == 3) TransposedTile<kRows, 3>(d, p, row, column);
+  if (n - column == 2) TransposedTile<kRows, 2>(d, p, row, column);
+  if (n - column == 1) TransposedTile<kRows, 1>(d, p, row, column);
 }
 
 template <typename T>
@@ -190,8 +189,8 @@ void TransposedProduct(const PackedProductOf<T>& p, int n) {
   constexpr int kRows = kManyRegisters ? 4 : 2;
   const hn::ScalableTag<T> d;
   int row = 0;
-  for (; row + kRows <= p.m; row += kRows) TransposedColumns<kRows, 4>(d, p, n, row);
-  for (; row < p.m; ++row) TransposedColumns<1, 4>(d, p, n, row);
+  for (; row + kRows <= p.m; row += kRows) TransposedRows<kRows>(d, p, n, row);
+  for (; row < p.m; ++row) TransposedRows<1>(d, p, n, row);
 }
 
 template <typename T>
