@@ -426,12 +426,12 @@ int Soak::Run() {
   }
   stop_ = report_.violations() >= 10;
   for (std::thread& thread : threads) thread.join();
-  const auto fifth = [](const std::vector<double>& all, bool last) {
-    const auto size = static_cast<ptrdiff_t>(all.size() / 5);
-    return Median(last ? std::vector<double>(all.end() - size, all.end()) : std::vector<double>(all.begin(), all.begin() + size));
+  const auto fifth = [](const std::vector<double>& all, int which) {
+    const auto size = static_cast<ptrdiff_t>(all.size() / 5), begin = which * size;
+    return Median(std::vector<double>(all.begin() + begin, all.begin() + begin + size));
   };
-  const double drift = 100 * (fifth(resident, true) / std::max(1.0, fifth(resident, false)) - 1);
-  const double file_drift = fifth(files, true) - fifth(files, false);
+  const double drift = 100 * (fifth(resident, 4) / std::max(1.0, fifth(resident, 0)) - 1);
+  const double file_drift = fifth(files, 4) - fifth(files, 0);
 
   std::fprintf(stderr, "soak: comparing %d streams with undisturbed ones\n", flags_.streams);
   end_ = steady_clock::now() + std::chrono::hours(1);
@@ -441,8 +441,10 @@ int Soak::Run() {
 
   std::printf("%.1f minutes, %d streams, seed %llu\n", flags_.minutes, flags_.streams, static_cast<unsigned long long>(flags_.seed));
   report_.Print();
-  std::printf("  %-44s %.1f MB, drift %.2f %%\n", "resident memory over the last third", fifth(resident, true), drift);
-  std::printf("  %-44s %.0f, drift %.0f\n", "open files over the last third", fifth(files, true), file_drift);
+  std::printf("  %-44s", "resident memory over the last third, MB");
+  for (int which = 0; which < 5; ++which) std::printf(" %.1f", fifth(resident, which));
+  std::printf(", drift %.2f %%\n", drift);
+  std::printf("  %-44s %.0f, drift %.0f\n", "open files over the last third", fifth(files, 4), file_drift);
   if (drift >= 2) report_.Violation(absl::StrCat("memory grows by ", drift, " %"));
   if (file_drift >= 1) report_.Violation("open files grow");
   std::printf("  %-44s %d\n", "violations", report_.violations());
