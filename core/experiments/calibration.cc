@@ -82,7 +82,7 @@ std::vector<Subject> Subjects(const Options& options) {
   };
   Learner oscillator{.data = TrainingData::kFleet, .specification = json::parse(kVanDerPol)};
   if (budget == Budget::kTiny) oscillator.specification.merge_patch(json::parse(kTinyVanDerPol));
-  add("van der Pol", oscillator, "van-der-pol", {{"noise_std", "0.005"}}, pick(100, 40, 6), hundred, pick(2000, 1000, 160), pick(400, 400, 120), pick(3000, 1500, 60));
+  add("van der Pol", oscillator, "van-der-pol", {{"noise_std", "0.005"}}, pick(300, 40, 6), hundred, pick(2000, 1000, 160), pick(400, 400, 120), pick(3000, 1500, 60));
   Learner hysteretic = BoucWenLearners(budget).front();
   hysteretic.specification["validation_share"] = 0.2;  // a tenth of a fleet says little about bounds
   add("Bouc–Wen", hysteretic, "bouc-wen", {{"noise_std", "7.5e-6"}}, pick(80, 12, 4), hundred, pick(10000, 2048, 300), pick(500, 500, 120), pick(1500, 1500, 60));
