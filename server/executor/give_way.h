@@ -18,7 +18,7 @@ class FreeProcessor {
   FreeProcessor& operator=(const FreeProcessor&) = delete;
 };
 
-/// A process whose work GivesWay, from its start on; to be removed when it has ended.
+/// Has a process leave it, too, from its start on; to be removed when it has ended.
 void AddBatchProcess(pid_t process);
 void RemoveBatchProcess(pid_t process);
 
