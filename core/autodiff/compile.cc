@@ -28,10 +28,10 @@ class Compiler {
   Program Run() {
     FindNeeded();
     uses_ = std::make_unique<Uses>(graph_, needed_, kept_);
+    Schedule();
     FindLastReaders();
     AssignOutputs();
-    for (Value v = 0; v < graph_.size(); ++v) {
-      if (!needed_[static_cast<size_t>(v)]) continue;
+    for (const Value v : order_) {
       Emit(v);
       ReleaseReadBy(v);
     }
@@ -127,6 +127,38 @@ class Compiler {
     return inputs;
   }
 
+  // ---- order ----
+
+  const std::vector<Value>& InputsOf(Value v) const {
+    return graph_.node(v).op == Op::kScan ? scan_inputs_.at(v) : graph_.node(v).inputs;
+  }
+
+  /// Outputs in the order in which they were made, each value shortly before who reads it first: a derivative's graph begins with all
+  /// that it is the derivative of, and what that is needed for comes much later. Of several operands the one with the longest way comes
+  /// first, so that the others need not be kept on it.
+  void Schedule() {
+    std::vector<int32_t> length(static_cast<size_t>(graph_.size()), 0);  // of the longest way to each value
+    for (Value v = 0; v < graph_.size(); ++v) {
+      if (!needed_[static_cast<size_t>(v)]) continue;
+      int32_t& own = length[static_cast<size_t>(v)];
+      for (const Value input : InputsOf(v)) own = std::max(own, length[static_cast<size_t>(input)] + 1);
+    }
+    std::vector<Value> roots;
+    for (const Output& output : outputs_) roots.push_back(output.value);
+    std::sort(roots.begin(), roots.end());
+    position_.assign(length.size(), -1);
+    for (const Value root : roots) ScheduleAfterInputs(root, length);
+  }
+
+  void ScheduleAfterInputs(Value v, const std::vector<int32_t>& length) {
+    if (position_[static_cast<size_t>(v)] >= 0) return;
+    std::vector<Value> inputs = InputsOf(v);
+    std::stable_sort(inputs.begin(), inputs.end(), [&](Value a, Value b) { return length[static_cast<size_t>(a)] > length[static_cast<size_t>(b)]; });
+    for (const Value input : inputs) ScheduleAfterInputs(input, length);
+    position_[static_cast<size_t>(v)] = static_cast<int64_t>(order_.size());
+    order_.push_back(v);
+  }
+
   // ---- lifetimes ----
 
   /// The value whose buffer `v` is read from.
@@ -137,29 +169,25 @@ class Compiler {
   }
 
   void FindLastReaders() {
-    const size_t size = static_cast<size_t>(graph_.size());
-    std::vector<Value> last(size, -1);
-    for (Value v = 0; v < graph_.size(); ++v) {
-      if (!needed_[static_cast<size_t>(v)]) continue;
-      const Node& node = graph_.node(v);
+    last_reader_.assign(static_cast<size_t>(graph_.size()), kNoValue);
+    for (const Value v : order_) {
       // A fused product's operands are read when the addition runs.
       const Value reader = uses_->fused[static_cast<size_t>(v)] ? uses_->last[static_cast<size_t>(v)] : v;
-      const std::vector<Value>& inputs = node.op == Op::kScan ? scan_inputs_.at(v) : node.inputs;
-      for (const Value input : inputs) {
-        Value& l = last[static_cast<size_t>(BufferOf(input))];
-        l = std::max(l, reader);
+      for (const Value input : InputsOf(v)) {
+        Value& last = last_reader_[static_cast<size_t>(BufferOf(input))];
+        if (last == kNoValue || position_[static_cast<size_t>(reader)] > position_[static_cast<size_t>(last)]) last = reader;
       }
     }
-    for (const Output& output : outputs_) last[static_cast<size_t>(BufferOf(output.value))] = graph_.size();
-    released_by_.assign(size + 1, {});
-    for (size_t v = 0; v < size; ++v) {
-      if (last[v] >= 0) released_by_[static_cast<size_t>(last[v])].push_back(static_cast<Value>(v));
+    for (const Output& output : outputs_) last_reader_[static_cast<size_t>(BufferOf(output.value))] = kNoValue;  // the caller
+    read_last_by_.assign(last_reader_.size(), {});
+    for (const Value v : order_) {
+      const Value last = last_reader_[static_cast<size_t>(v)];
+      if (last != kNoValue) read_last_by_[static_cast<size_t>(last)].push_back(v);
     }
-    last_reader_ = std::move(last);
   }
 
   void ReleaseReadBy(Value reader) {
-    for (const Value v : released_by_[static_cast<size_t>(reader)]) Release(v);
+    for (const Value v : read_last_by_[static_cast<size_t>(reader)]) Release(v);
   }
 
   void Release(Value v) {
@@ -183,13 +211,28 @@ class Compiler {
     }
   }
 
-  /// Where a computed value goes: its output slot, the buffer of an operand that dies here, or a new one.
-  Operand Destination(Value v, Value reusable) {
+  bool IsOverwrittenBy(Value reusable, Value reader) const {
+    return reusable != kNoValue && last_reader_[static_cast<size_t>(reusable)] == reader &&
+           SizeOf(graph_.node(reusable)) == SizeOf(graph_.node(reader));
+  }
+
+  /// The output that `v` is, or that the operations that overwrite it make of it.
+  const Output* OutputOf(Value v) const {
+    for (Value at = v;;) {
+      const auto bound = bound_.find(at);
+      if (bound != bound_.end()) return bound->second;
+      const Value reader = last_reader_[static_cast<size_t>(at)];
+      if (reader == kNoValue || !IsOverwrittenBy(at, reader) || Reusable(reader) != at) return nullptr;
+      at = reader;
+    }
+  }
+
+  /// Where a computed value goes: an output slot, the buffer of an operand that dies here, or a new one.
+  Operand Destination(Value v) {
     const Node& node = graph_.node(v);
-    const auto bound = bound_.find(v);
-    if (bound != bound_.end()) return SlotOperand(*bound->second, node.rows);
-    if (reusable != kNoValue && last_reader_[static_cast<size_t>(reusable)] == v && buffers_.count(reusable) != 0 &&
-        buffers_[reusable].size() == 1 && buffers_[reusable][0].second == SizeOf(node)) {
+    if (const Output* output = OutputOf(v)) return SlotOperand(*output, node.rows);
+    const Value reusable = Reusable(v);
+    if (IsOverwrittenBy(reusable, v) && buffers_.count(reusable) != 0 && buffers_[reusable].size() == 1) {
       auto buffer = buffers_.extract(reusable);
       buffer.key() = v;
       const int64_t offset = buffer.mapped()[0].first;
@@ -340,13 +383,14 @@ class Compiler {
       return;
     }
     if (uses_->fused[static_cast<size_t>(v)]) return;
-    where = Destination(v, Reusable(node));
+    where = Destination(v);
     EmitOperation(graph_, *uses_, kept_, node, where, [this](Value input) { return place(input); },
                   &program_.instructions);
   }
 
   /// An operand whose buffer the result may overwrite: read elementwise, untiled, and not a view of something else.
-  Value Reusable(const Node& node) const {
+  Value Reusable(Value v) const {
+    const Node& node = graph_.node(v);
     const bool elementwise = IsBinaryElementwise(node.op) || node.op == Op::kScale || node.op == Op::kActivation;
     if (!elementwise) return kNoValue;
     const Value product = node.op == Op::kAdd ? uses_->FusableProduct(graph_, node, kept_) : kNoValue;
@@ -496,8 +540,10 @@ class Compiler {
   std::vector<bool> needed_, kept_;
   std::unique_ptr<Uses> uses_;
   std::vector<Operand> place_;
+  std::vector<Value> order_;
+  std::vector<int64_t> position_;  // in order_
   std::vector<Value> last_reader_;
-  std::vector<std::vector<Value>> released_by_;
+  std::vector<std::vector<Value>> read_last_by_;
   std::map<Value, std::vector<std::pair<int64_t, int64_t>>> buffers_;  // owner → places in the arena
   std::map<Value, const Output*> bound_;
   std::map<Value, std::vector<Value>> scan_inputs_;

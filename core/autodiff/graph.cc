@@ -38,6 +38,11 @@ Value Graph::Append(Node node) {
   return size() - 1;
 }
 
+void Graph::TurnIntoInput(Value v, int32_t slot, int64_t offset) {
+  Node& turned = nodes_[static_cast<size_t>(v)];
+  turned = {.op = Op::kInput, .rows = turned.rows, .cols = turned.cols, .slot = slot, .offset = offset};
+}
+
 bool Graph::IsConstant(Value v, double scalar) const {
   return node(v).op == Op::kConstant && !node(v).data && node(v).scalar == scalar;
 }

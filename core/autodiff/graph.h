@@ -119,6 +119,8 @@ class Graph {
 
   /// Appends `node` as it is (for transforms that copy nodes).
   Value Append(Node node);
+  /// From here on `v` is read from a slot: somebody else computes it.
+  void TurnIntoInput(Value v, int32_t slot, int64_t offset);
 
  private:
   std::vector<Node> nodes_;

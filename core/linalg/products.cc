@@ -2,7 +2,8 @@
 //
 // A tile of C, some vectors of rows by some columns, stays in registers while k runs; each step takes one column of A and one
 // row of B. The tile wants A's columns contiguous and at hand, so a strip of A, as high as the tile and kDepth deep, is copied
-// to a panel where this pays or where A is transposed, and serves all columns of C. For a transposed A and few columns, as
+// to a panel where this pays or where A is transposed, and serves all columns of C; meanwhile the next strip is called for, since weights
+// mostly lie beyond the second-level cache and their short columns escape the processor's own foresight. For a transposed A and few columns, as
 // when a layer's weights meet one sample and its tangents, the copy would cost more than the product: there both factors are
 // contiguous along k, and a tile is a set of scalar products.
 
@@ -38,6 +39,8 @@ constexpr int kDepth = kManyRegisters ? 128 : 256;  // a panel leaves a third of
 constexpr int kCopyFromTiles = 4;  // tiles of a strip from which on a copy of it pays
 constexpr int kDotMaxColumns = 12;
 constexpr int kDotMinDepthVectors = 4;
+constexpr int kToRead = 0, kToWrite = 1, kSecondLevel = 2, kFirstLevel = 3;  // of __builtin_prefetch
+constexpr int kLine = 64;  // bytes of the cache
 
 /// A matrix that is read by single elements: element (row, column) is at[row · by_row + column · by_column].
 template <typename T>
@@ -53,18 +56,28 @@ struct Target {
   bool accumulate;
 };
 
+/// What will be read next, brought nearer meanwhile: a line of the cache at each step of k.
+template <typename T>
+struct Ahead {
+  const T* at;
+  ptrdiff_t by;
+};
+
 /// The first `rows` rows of kVectors vectors by kColumns columns of C.
 template <int kVectors, int kColumns, class D, typename T = hn::TFromD<D>>
-HWY_INLINE void Tile(D d, int rows, int k, const T* HWY_RESTRICT a, ptrdiff_t lda, Strided<T> b, Target<T> c) {
+HWY_INLINE void Tile(D d, int rows, int k, const T* HWY_RESTRICT a, ptrdiff_t lda, Strided<T> b, Target<T> c, Ahead<T> ahead) {
   const int lanes = static_cast<int>(hn::Lanes(d));
   hn::Vec<D> sums[kColumns][kVectors];
   METAEKF_UNROLL
   for (int j = 0; j < kColumns; ++j) {
     METAEKF_UNROLL
     for (int i = 0; i < kVectors; ++i) sums[j][i] = hn::Zero(d);
+    METAEKF_UNROLL
+    for (int i = 0; i < kVectors; ++i) __builtin_prefetch(c.at + j * c.ld + i * lanes, kToWrite, kFirstLevel);
   }
   const T* b_row = b.at;
-  for (int l = 0; l < k; ++l, a += lda, b_row += b.by_row) {
+  for (int l = 0; l < k; ++l, a += lda, b_row += b.by_row, ahead.at += ahead.by) {
+    __builtin_prefetch(ahead.at, kToRead, kSecondLevel);
     hn::Vec<D> column[kVectors];
     METAEKF_UNROLL
     for (int i = 0; i < kVectors; ++i) column[i] = hn::LoadU(d, a + i * lanes);
@@ -98,19 +111,20 @@ HWY_INLINE void Tile(D d, int rows, int k, const T* HWY_RESTRICT a, ptrdiff_t ld
 
 /// A tile of `columns` ≤ kMost columns.
 template <int kVectors, int kMost = kTileColumns, class D, typename T = hn::TFromD<D>>
-HWY_INLINE void TileOf(D d, int rows, int columns, int k, const T* a, ptrdiff_t lda, Strided<T> b, Target<T> c) {
+HWY_INLINE void TileOf(D d, int rows, int columns, int k, const T* a, ptrdiff_t lda, Strided<T> b, Target<T> c, Ahead<T> ahead) {
   if constexpr (kMost > 1) {
-    if (columns < kMost) return TileOf<kVectors, kMost - 1>(d, rows, columns, k, a, lda, b, c);
+    if (columns < kMost) return TileOf<kVectors, kMost - 1>(d, rows, columns, k, a, lda, b, c, ahead);
   }
-  Tile<kVectors, kMost>(d, rows, k, a, lda, b, c);
+  Tile<kVectors, kMost>(d, rows, k, a, lda, b, c, ahead);
 }
 
 /// One row of tiles, `columns` wide. They are few and of nearly the same width: in a narrow one sums wait for themselves.
 template <int kVectors, class D, typename T = hn::TFromD<D>>
-HWY_INLINE void Strip(D d, int rows, int columns, int k, const T* a, ptrdiff_t lda, Strided<T> b, Target<T> c) {
+HWY_INLINE void Strip(D d, int rows, int columns, int k, const T* a, ptrdiff_t lda, Strided<T> b, Target<T> c, Ahead<T> ahead) {
   for (int tiles = (columns + kTileColumns - 1) / kTileColumns; tiles > 0; --tiles) {
     const int width = (columns + tiles - 1) / tiles;
-    TileOf<kVectors>(d, rows, width, k, a, lda, b, c);
+    TileOf<kVectors>(d, rows, width, k, a, lda, b, c, ahead);
+    ahead.at += kLine / sizeof(T);
     columns -= width;
     b.at += width * b.by_column;
     c.at += width * c.ld;
@@ -202,7 +216,9 @@ void Panels(D d, int m, int n, int k, Strided<T> a, Strided<T> b, Target<T> c) {
       const Target<T> to{c.at + row, c.ld, c.accumulate};
       const bool copy = a.by_row != 1 || rows != full || n >= kCopyFromTiles * kTileColumns;
       if (copy) CopyPanel(tag, rows, full, part, from, panel);
-      Strip<kVectors>(tag, rows, n, part, copy ? panel : from.at, copy ? full : a.by_column, b_part, to);
+      const T* const next = row + full < m ? from.at + full * a.by_row : a.at + (depth + kDepth) * a.by_column;
+      const Ahead<T> ahead{next, a.by_row == 1 ? a.by_column : a.by_row};
+      Strip<kVectors>(tag, rows, n, part, copy ? panel : from.at, copy ? full : a.by_column, b_part, to, ahead);
     };
     int row = 0;
     for (; row + height <= m; row += height) strip(d, std::integral_constant<int, kTileVectors>(), row, height);

@@ -117,7 +117,7 @@ absl::StatusOr<FitResult> Fit(const Bundle& bundle, nssm::LossSpec loss, double 
     loss.stride *= static_cast<int32_t>((columns + kMaxColumns - 1) / kMaxColumns);
     METAEKF_ASSIGN_OR_RETURN(shape, nssm::ShapeOfLoss(spec, loss, context.length()));
   }
-  const LossFunction<T> function(bundle.model, loss, shape, mask, mask);
+  const LossFunction<T> function(bundle.model, loss, shape, mask, mask, nssm::HessianProducts::kNone);
   auto scratch = function.MakeScratch(options.executor);
   const LossData<T> data = nssm::CutLossData<T>(spec, loss, context, 0, shape);
   FitResult result;

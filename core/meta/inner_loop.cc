@@ -86,7 +86,7 @@ const T* InnerLoop<T>::Run(const T* start, const std::vector<double>& rates, Gra
   std::fill(trace->total_.begin(), trace->total_.end(), T(0));
   for (int32_t m = 1; m <= steps_; ++m) {
     const T* current = trace->At(trace->iterates_, m - 1);
-    gradient(current, trace->At(trace->gradients_, m - 1));
+    gradient(m, current, trace->At(trace->gradients_, m - 1));
     Step(m, start, rates, current, trace->At(trace->iterates_, m), trace);
   }
   return trace->At(trace->iterates_, steps_);
@@ -132,22 +132,38 @@ void InnerLoop<T>::Step(int32_t m, const T* start, const std::vector<double>& ra
 }
 
 template <typename T>
-void InnerLoop<T>::StepAdjoint(int32_t m, const std::vector<double>& rates, const T* adjoint, Trace* trace,
-                               double* rate_adjoint) const {
+void InnerLoop<T>::Subtract(const nn::Pieces& pieces, const T* product, T* adjoint, base::Executor* executor) {
+  nn::ForParts(pieces, executor, [&](size_t, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) adjoint[i] -= product[i];
+  });
+}
+
+template <typename T>
+void InnerLoop<T>::AddRateAdjoint(int32_t m, const T* adjoint, Trace* trace, double* rate_adjoint) const {
   const AdamCorrections corrections(m);
   const T* gradient = trace->At(trace->gradients_, m - 1);
   const T* first = trace->At(trace->first_, m - 1);
   const T* second = trace->At(trace->second_, m - 1);
   const bool is_adam = optimiser_ == Optimiser::kAdam;
-  for (size_t l = 0; rate_adjoint && l < adapted_.size(); ++l) {
+  for (size_t l = 0; l < adapted_.size(); ++l) {
     double by_rate = 0;
     for (int64_t i = adapted_[l].first; i < adapted_[l].first + adapted_[l].second; ++i) {
       by_rate += static_cast<double>(adjoint[i]) * (is_adam ? Direction(first[i], second[i], corrections) : static_cast<double>(gradient[i]));
     }
     rate_adjoint[l] -= by_rate;
   }
+}
+
+template <typename T>
+void InnerLoop<T>::StepAdjoint(int32_t m, const std::vector<double>& rates, const T* product, T* adjoint, Trace* trace) const {
+  const AdamCorrections corrections(m);
+  const T* gradient = trace->At(trace->gradients_, m - 1);
+  const T* first = trace->At(trace->first_, m - 1);
+  const T* second = trace->At(trace->second_, m - 1);
+  const bool is_adam = optimiser_ == Optimiser::kAdam;
   nn::ForParts(adapted_, trace->executor_, [&](size_t l, int64_t begin, int64_t end) {
     T* direction = trace->direction_.data();
+    for (int64_t i = begin; product != nullptr && i < end; ++i) adjoint[i] -= product[i];
     for (int64_t i = begin; !is_adam && i < end; ++i) direction[i] = static_cast<T>(rates[l] * static_cast<double>(adjoint[i]));
     for (int64_t i = begin; is_adam && i < end; ++i) {
       direction[i] = static_cast<T>(PullBackAdam(rates[l] * static_cast<double>(adjoint[i]), gradient[i], first[i], second[i], corrections,
@@ -162,16 +178,17 @@ void InnerLoop<T>::PullBack(const std::vector<double>& rates, HessianVector hess
   for (auto* vector : {&trace->direction_, &trace->first_adjoint_, &trace->second_adjoint_}) {
     std::fill(vector->begin(), vector->end(), T(0));
   }
+  const T* const product = trace->product_.data();
   for (int32_t m = steps_; m >= 1; --m) {
-    StepAdjoint(m, rates, adjoint, trace, rate_adjoint);
-    hessian_vector(trace->At(trace->iterates_, m - 1), trace->direction_.data(), trace->product_.data());
-    const T* product = trace->product_.data();
-    for (const nn::Pieces* pieces : {&adapted_, &frozen_}) {
-      nn::ForParts(*pieces, trace->executor_, [&](size_t, int64_t begin, int64_t end) {
-        for (int64_t i = begin; i < end; ++i) adjoint[i] -= product[i];
-      });
-    }
+    // Of the elements that adapt the later step's product is taken where the direction is made: every pass through ω counts.
+    const bool later = m < steps_, pass_of_its_own = later && rate_adjoint != nullptr;
+    if (pass_of_its_own) Subtract(adapted_, product, adjoint, trace->executor_);
+    if (rate_adjoint != nullptr) AddRateAdjoint(m, adjoint, trace, rate_adjoint);
+    StepAdjoint(m, rates, later && !pass_of_its_own ? product : nullptr, adjoint, trace);
+    hessian_vector(m, trace->At(trace->iterates_, m - 1), trace->direction_.data(), trace->product_.data());
+    Subtract(frozen_, product, adjoint, trace->executor_);
   }
+  if (steps_ > 0) Subtract(adapted_, product, adjoint, trace->executor_);
 }
 
 template class InnerLoop<float>;

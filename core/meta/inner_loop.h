@@ -61,8 +61,9 @@ class InnerLoop {
     std::vector<T> direction_, product_, first_adjoint_, second_adjoint_;  // of PullBack
   };
 
-  using Gradient = absl::FunctionRef<void(const T* at, T* gradient)>;
-  using HessianVector = absl::FunctionRef<void(const T* at, const T* v, T* product)>;
+  /// Of step m = 1 … M, at ω_{m−1}.
+  using Gradient = absl::FunctionRef<void(int32_t m, const T* at, T* gradient)>;
+  using HessianVector = absl::FunctionRef<void(int32_t m, const T* at, const T* v, T* product)>;
 
   /// @param rates  β of every adapted tensor, in the layout's order. @param gradient  writes all elements.
   /// @return ω_M, inside the trace.
@@ -92,8 +93,11 @@ class InnerLoop {
  private:
   /// From ω_{m−1} to ω_m, which may be one place.
   void Step(int32_t m, const T* start, const std::vector<double>& rates, const T* from, T* to, Trace* trace) const;
-  /// Writes what H is multiplied by in step m.
-  void StepAdjoint(int32_t m, const std::vector<double>& rates, const T* adjoint, Trace* trace, double* rate_adjoint) const;
+  /// β̄ ← β̄ − ⟨ω̄, d⟩ of step m.
+  void AddRateAdjoint(int32_t m, const T* adjoint, Trace* trace, double* rate_adjoint) const;
+  /// Writes what H is multiplied by in step m, after the product of step m + 1, or null, is subtracted from ω̄.
+  void StepAdjoint(int32_t m, const std::vector<double>& rates, const T* product, T* adjoint, Trace* trace) const;
+  static void Subtract(const nn::Pieces& pieces, const T* product, T* adjoint, base::Executor* executor);
 
   int64_t size_;
   nn::Pieces adapted_, frozen_;

@@ -18,6 +18,7 @@ namespace {
 constexpr int kSettlingSteps = 10;  // of Newton, at most
 constexpr int kPowerSteps = 30;
 constexpr double kPowerTolerance = 0.01;  // relative
+constexpr int64_t kMostRecorded = 2;  // of a step, in parameter vectors
 constexpr double kSettled = 0.25;   // of the last squared slope: one that falls no further is down to rounding
 
 nn::Mask AllOf(const nssm::Model& model) { return nn::Mask(model.layout().tensors().size(), true); }
@@ -34,6 +35,17 @@ InnerLoop<T> MakeLoop(const nssm::Model& model, const TrainingSpec& spec, const 
   const int32_t steps = one_loop ? 0 : spec.inner_loop.steps;
   const double pull = spec.algorithm == Algorithm::kImplicitMaml ? spec.inner_loop.proximal : 0;
   return InnerLoop<T>(model.layout(), adapted, spec.inner_loop.optimiser, steps, pull, RecordFor(spec));
+}
+
+/// The loss on the context set whose Hessian the meta-gradient needs. MAML's products are at the points of the gradients before them, which
+/// record their activations unless these are far larger than ω: they are kept for every step.
+template <typename T>
+nssm::LossFunction<T> OuterLoss(const nssm::Model& model, const TrainingSpec& spec, const LossShape& context, const nn::Mask& adapted) {
+  if (spec.algorithm == Algorithm::kMaml) {
+    nssm::LossFunction<T> recording(model, spec.loss, context, AllOf(model), adapted, nssm::HessianProducts::kFromRecord);
+    if (recording.record_size() <= kMostRecorded * model.layout().size()) return recording;
+  }
+  return nssm::LossFunction<T>(model, spec.loss, context, AllOf(model), adapted);
 }
 
 bool GoesToMinimum(const TrainingSpec& spec) {
@@ -77,8 +89,8 @@ MetaGradient<T>::MetaGradient(const nssm::Model& model, const TrainingSpec& spec
       proximal_(spec.inner_loop.proximal),
       tolerance_(spec.implicit_maml.cg_tolerance),
       inner_(model, spec.loss, context, adapted, adapted),
-      outer_(model, spec.loss, context, AllOf(model), adapted),
-      target_(model, spec.loss, target, AllOf(model), adapted) {
+      outer_(OuterLoss<T>(model, spec, context, adapted)),
+      target_(model, spec.loss, target, AllOf(model), adapted, nssm::HessianProducts::kNone) {
   if (GoesToMinimum(spec)) least_squares_.emplace(model, spec.loss, adapted, false);
 }
 
@@ -89,6 +101,7 @@ MetaGradient<T>::Scratch::Scratch(const MetaGradient& owner, base::Executor* exe
       target_gradient_(owner.algorithm_ == Algorithm::kReptile ? static_cast<size_t>(owner.size_) : 0),
       rates_(owner.rates_),
       rate_adjoints_(owner.rates_.size()),
+      records_(static_cast<size_t>(owner.steps_ * owner.outer_.record_size())),
       loss_({&owner.inner_, &owner.outer_, &owner.target_}, executor) {
   if (!owner.least_squares_) return;
   least_squares_ = std::make_unique<nssm::RolloutLeastSquares::Workspace>(*owner.least_squares_, owner.inner_.shape());
@@ -111,8 +124,14 @@ template <typename T>
 const T* MetaGradient<T>::Adapt(const T* variables, const LossData<T>& context, Scratch* scratch) const {
   if (least_squares_) return Minimum(variables, context, scratch);
   ReadRates(variables, scratch);
-  const auto gradient = [&](const T* at, T* result) { inner_.Gradient(at, context, result, &scratch->loss_); };
+  const nssm::LossFunction<T>& loss = records() ? outer_ : inner_;
+  const auto gradient = [&](int32_t m, const T* at, T* result) { loss.Gradient(at, context, result, &scratch->loss_, RecordOf(m, scratch)); };
   return loop_.Run(variables, scratch->rates_, gradient, &scratch->trace_);
+}
+
+template <typename T>
+T* MetaGradient<T>::RecordOf(int32_t m, Scratch* scratch) const {
+  return records() ? scratch->records_.data() + (m - 1) * outer_.record_size() : nullptr;
 }
 
 template <typename T>
@@ -202,8 +221,8 @@ double MetaGradient<T>::Compute(const T* variables, const LossData<T>& context, 
 
 template <typename T>
 void MetaGradient<T>::PullBack(const LossData<T>& context, T* gradient, Scratch* scratch) const {
-  const auto hessian_vector = [&](const T* at, const T* v, T* product) {
-    outer_.HessianVector(at, context, v, product, &scratch->loss_);
+  const auto hessian_vector = [&](int32_t m, const T* at, const T* v, T* product) {
+    outer_.HessianVector(at, context, v, product, &scratch->loss_, RecordOf(m, scratch));
   };
   loop_.PullBack(scratch->rates_, hessian_vector, &scratch->trace_, gradient,
                  learned_rates_ ? scratch->rate_adjoints_.data() : nullptr);
@@ -229,7 +248,7 @@ double MetaGradient<T>::Reptile(const T* variables, const LossData<T>& context, 
   const auto samples = [](const LossShape& shape) { return static_cast<double>(shape.rollouts) * shape.horizon; };
   const double share = samples(context.shape) / (samples(context.shape) + samples(target.shape));
   T* of_target = scratch->target_gradient_.data();
-  const auto union_gradient = [&](const T* at, T* result) {
+  const auto union_gradient = [&](int32_t, const T* at, T* result) {
     outer_.Gradient(at, context, result, &scratch->loss_);
     target_.Gradient(at, target, of_target, &scratch->loss_);
     for (int64_t i = 0; i < size_; ++i) result[i] = static_cast<T>(share * result[i] + (1 - share) * of_target[i]);

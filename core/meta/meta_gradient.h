@@ -41,7 +41,8 @@ class MetaGradient {
   MetaGradient(const nssm::Model& model, const TrainingSpec& spec, const nssm::LossShape& context,
                const nssm::LossShape& target, const nn::Mask& adapted);
 
-  /// Memory of one caller: what InnerLoop::Trace holds, and one step's activations.
+  /// Memory of one caller: what InnerLoop::Trace holds, and one step's activations; of MAML every step's, where these are not many more
+  /// than the parameters.
   class Scratch {
    public:
     /// @param executor  that the gradients of large models run on (nssm::LossFunction); it must outlive the scratch.
@@ -55,9 +56,12 @@ class MetaGradient {
     std::unique_ptr<nssm::RolloutLeastSquares::Workspace> least_squares_;
     std::vector<T> minimum_, last_, step_;  // of Minimum and Settle
     std::vector<double> rates_, rate_adjoints_;
+    std::vector<T> records_;  // of outer_, for every step
     typename nssm::LossFunction<T>::Scratch loss_;
   };
 
+  /// Whether the gradients of the inner loop record what the products at their points need.
+  bool records() const { return outer_.record_size() > 0; }
   /// n_ω, and the number of adapted tensors if rates are learned.
   size_t variables() const;
 
@@ -80,6 +84,8 @@ class MetaGradient {
   void Settle(const T* start, const nssm::LossData<T>& context, Scratch* scratch) const;
   /// @return ω_M.
   const T* Adapt(const T* variables, const nssm::LossData<T>& context, Scratch* scratch) const;
+  /// Where outer_ keeps what it has computed in step m, or null.
+  T* RecordOf(int32_t m, Scratch* scratch) const;
   double Reptile(const T* variables, const nssm::LossData<T>& context, const nssm::LossData<T>& target, T* gradient,
                  Scratch* scratch) const;
   void PullBack(const nssm::LossData<T>& context, T* gradient, Scratch* scratch) const;

@@ -3,6 +3,7 @@
 #include <algorithm>
 
 #include "core/autodiff/differentiate.h"
+#include "core/autodiff/keep.h"
 #include "core/base/status.h"
 
 namespace metaekf::nssm {
@@ -22,6 +23,7 @@ enum Slot : int32_t {
   kStates,
   kOutputs,
   kFirstOutput,
+  kRecord,
   kLossOut,
   kVectorOut,
 };
@@ -163,23 +165,26 @@ LossData<T> CutLossData(const ModelSpec& model, const LossSpec& loss, const data
 
 template <typename T>
 LossFunction<T>::LossFunction(const Model& model, const LossSpec& loss, const LossShape& shape,
-                              const nn::Mask& differentiated, const nn::Mask& along)
-    : shape_(shape),
-      size_(model.layout().size()),
-      differentiated_(nn::PiecesOf(model.layout(), differentiated, true)),
-      undifferentiated_(nn::PiecesOf(model.layout(), differentiated, false)) {
+                              const nn::Mask& differentiated, const nn::Mask& along, HessianProducts products)
+    : shape_(shape), size_(model.layout().size()) {
+  const auto written = [&model](const nn::Mask& mask) {
+    return Written{nn::PiecesOf(model.layout(), mask, true), nn::PiecesOf(model.layout(), mask, false)};
+  };
+  of_gradient_ = written(products == HessianProducts::kFromRecord ? along : differentiated);
+  of_product_ = written(differentiated);
   int32_t first = 0, last_count = 0;
   for (const int32_t count : BlockSizes(shape, size_)) {
-    if (count != last_count) programs_.push_back(Compile(model, loss, count, differentiated, along));
-    blocks_.push_back({first, count, programs_.size() - 1});
+    if (count != last_count) programs_.push_back(Compile(model, loss, count, differentiated, along, products));
+    blocks_.push_back({first, count, programs_.size() - 1, record_size_});
     first += count;
     last_count = count;
+    record_size_ += programs_.back().record_size;
   }
 }
 
 template <typename T>
 typename LossFunction<T>::Programs LossFunction<T>::Compile(const Model& model, const LossSpec& loss, int32_t rollouts,
-                                                            const nn::Mask& differentiated, const nn::Mask& along) const {
+                                                            const nn::Mask& differentiated, const nn::Mask& along, HessianProducts products) const {
   Graph graph;
   const nn::ParameterLayout& layout = model.layout();
   const nn::ParameterValues parameters = nn::BindParameters(layout, kParameters, &graph);
@@ -187,26 +192,35 @@ typename LossFunction<T>::Programs LossFunction<T>::Compile(const Model& model, 
   const double share = static_cast<double>(rollouts) / shape_.rollouts;
   const autodiff::Value total = graph.Scale(BuildLoss(model, loss, {rollouts, shape_.horizon}, parameters, &graph), share);
   std::vector<autodiff::Value> wrt;
-  std::vector<int64_t> offsets;
+  std::vector<size_t> tensors;
   std::vector<autodiff::Seed> seeds;
   for (size_t i = 0; i < parameters.size(); ++i) {
     if (along[i]) seeds.push_back({parameters[i], directions[i]});
     if (!differentiated[i]) continue;
     wrt.push_back(parameters[i]);
-    offsets.push_back(layout.tensors()[i].offset);
+    tensors.push_back(i);
   }
   autodiff::Executable<T> value(autodiff::Compile(graph, {{total, kLossOut}}));
   const std::vector<autodiff::Value> gradient = autodiff::Gradient(&graph, total, wrt);
-  std::vector<autodiff::Value> product = autodiff::Jvp(&graph, seeds, gradient);
+  const bool records = products == HessianProducts::kFromRecord;
+  std::vector<autodiff::Value> product;
+  if (products != HessianProducts::kNone) product = autodiff::Jvp(&graph, seeds, gradient);
   std::vector<Output> gradient_outputs{{total, kLossOut}}, product_outputs;
   for (size_t i = 0; i < wrt.size(); ++i) {
+    const int64_t offset = layout.tensors()[tensors[i]].offset;
+    if (!records || along[tensors[i]]) gradient_outputs.push_back({gradient[i], kVectorOut, offset});
+    if (product.empty()) continue;
     const autodiff::Node shape_of = graph.node(gradient[i]);
     if (product[i] == kNoValue) product[i] = graph.Constant(0, shape_of.rows, shape_of.cols);
-    gradient_outputs.push_back({gradient[i], kVectorOut, offsets[i]});
-    product_outputs.push_back({product[i], kVectorOut, offsets[i]});
+    product_outputs.push_back({product[i], kVectorOut, offset});
   }
-  return {std::move(value), autodiff::Executable<T>(autodiff::Compile(graph, gradient_outputs)),
-          autodiff::Executable<T>(autodiff::Compile(graph, product_outputs))};
+  std::vector<Output> kept;
+  if (records) kept = autodiff::ValuesToKeep(graph, gradient_outputs, product_outputs, kRecord);
+  gradient_outputs.insert(gradient_outputs.end(), kept.begin(), kept.end());
+  autodiff::Executable<T> of_gradient(autodiff::Compile(graph, gradient_outputs));
+  const int64_t record_size = autodiff::SizeOfKept(graph, kept);
+  for (const Output& output : kept) graph.TurnIntoInput(output.value, output.slot, output.offset);
+  return {std::move(value), std::move(of_gradient), autodiff::Executable<T>(autodiff::Compile(graph, product_outputs)), record_size};
 }
 
 template <typename T>
@@ -227,7 +241,7 @@ LossFunction<T>::Scratch::Scratch(std::initializer_list<const LossFunction*> use
 
 template <typename T>
 double LossFunction<T>::RunBlocks(autodiff::Executable<T> Programs::*program, const T* parameters, const LossData<T>& data, const T* v,
-                                  T* vector, Scratch* scratch) const {
+                                  T* vector, T* record, Scratch* scratch) const {
   const auto run = [&](size_t block, const LossData<T>& of_block, T* to, size_t arena) {
     Slots<T> slots;
     slots.Input(kParameters, parameters)
@@ -238,6 +252,7 @@ double LossFunction<T>::RunBlocks(autodiff::Executable<T> Programs::*program, co
         .Input(kOutputs, of_block.outputs.data())
         .Input(kFirstOutput, of_block.first_output.data())
         .Input(kDirection, v)
+        .Output(kRecord, record == nullptr ? nullptr : record + blocks_[block].record)
         .Output(kLossOut, &scratch->losses_[block])
         .Output(kVectorOut, to);
     autodiff::Evaluate(programs_[blocks_[block].programs].*program, slots, scratch->arenas_[arena]);
@@ -251,35 +266,40 @@ double LossFunction<T>::RunBlocks(autodiff::Executable<T> Programs::*program, co
       run(block, scratch->data_[block], block == 0 ? vector : scratch->vectors_[block].data(), scratch->arenas_.size() >= blocks ? block : slot);
     });
   }
-  if (vector != nullptr) {
-    for (const auto& [offset, size] : undifferentiated_) std::fill_n(vector + offset, size, T(0));
-  }
-  if (vector != nullptr && blocks > 1) {
-    nn::ForParts(differentiated_, scratch->executor_, [&](size_t, int64_t begin, int64_t end) {
-      for (size_t block = 1; block < blocks; ++block) {
-        const T* const other = scratch->vectors_[block].data();
-        for (int64_t i = begin; i < end; ++i) vector[i] += other[i];
-      }
-    });
-  }
   double sum = 0;
   for (size_t block = 0; block < blocks; ++block) sum += static_cast<double>(scratch->losses_[block]);
   return sum;
 }
 
 template <typename T>
+void LossFunction<T>::AddBlocks(const Written& written, T* vector, Scratch* scratch) const {
+  for (const auto& [offset, size] : written.rest) std::fill_n(vector + offset, size, T(0));
+  if (blocks_.size() == 1) return;
+  nn::ForParts(written.pieces, scratch->executor_, [&](size_t, int64_t begin, int64_t end) {
+    for (size_t block = 1; block < blocks_.size(); ++block) {
+      const T* const other = scratch->vectors_[block].data();
+      for (int64_t i = begin; i < end; ++i) vector[i] += other[i];
+    }
+  });
+}
+
+template <typename T>
 double LossFunction<T>::Value(const T* parameters, const LossData<T>& data, Scratch* scratch) const {
-  return RunBlocks(&Programs::value, parameters, data, nullptr, nullptr, scratch);
+  return RunBlocks(&Programs::value, parameters, data, nullptr, nullptr, nullptr, scratch);
 }
 
 template <typename T>
-double LossFunction<T>::Gradient(const T* parameters, const LossData<T>& data, T* gradient, Scratch* scratch) const {
-  return RunBlocks(&Programs::gradient, parameters, data, nullptr, gradient, scratch);
+double LossFunction<T>::Gradient(const T* parameters, const LossData<T>& data, T* gradient, Scratch* scratch, T* record) const {
+  const double loss = RunBlocks(&Programs::gradient, parameters, data, nullptr, gradient, record, scratch);
+  AddBlocks(of_gradient_, gradient, scratch);
+  return loss;
 }
 
 template <typename T>
-void LossFunction<T>::HessianVector(const T* parameters, const LossData<T>& data, const T* v, T* product, Scratch* scratch) const {
-  RunBlocks(&Programs::hessian, parameters, data, v, product, scratch);
+void LossFunction<T>::HessianVector(const T* parameters, const LossData<T>& data, const T* v, T* product, Scratch* scratch,
+                                    const T* record) const {
+  RunBlocks(&Programs::hessian, parameters, data, v, product, const_cast<T*>(record), scratch);
+  AddBlocks(of_product_, product, scratch);
 }
 
 template LossData<float> CutLossData(const ModelSpec&, const LossSpec&, const data::Trajectory&, int64_t, const LossShape&);

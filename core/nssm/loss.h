@@ -44,6 +44,13 @@ template <typename T>
 LossData<T> CutLossData(const ModelSpec& model, const LossSpec& loss, const data::Trajectory& normalised, int64_t first,
                         const LossShape& shape);
 
+/// How a loss function makes products with its Hessian.
+enum class HessianProducts {
+  kNone,        ///< it makes none
+  kFromScratch,
+  kFromRecord,  ///< from what the gradient at the same point has recorded: in three quarters of the operations
+};
+
 /// L(set; ω), its gradient and its Hessian–vector products, for sets of one shape.
 ///
 ///   Case I    L = w_y MSE(y_{t+k}, ŷ_{t+k})_{k=1…H_p} + w_r MSE(y_t, 𝓟𝓓y𝓔)
@@ -60,8 +67,9 @@ template <typename T>
 class LossFunction {
  public:
   /// @param differentiated  parameters with a gradient; @param along  parameters in which directions v may be non-zero.
+  /// @param products  kFromRecord: gradients are those of the parameters of `along` alone.
   LossFunction(const Model& model, const LossSpec& loss, const LossShape& shape, const nn::Mask& differentiated,
-               const nn::Mask& along);
+               const nn::Mask& along, HessianProducts products = HessianProducts::kFromScratch);
 
   /// Memory of one caller, for any of a few functions, one at a time.
   class Scratch {
@@ -81,10 +89,14 @@ class LossFunction {
   Scratch MakeScratch(base::Executor* executor = base::CallingThread()) const { return Scratch({this}, executor); }
 
   double Value(const T* parameters, const LossData<T>& data, Scratch* scratch) const;
-  /// @param gradient  n_ω elements, all written. @return L.
-  double Gradient(const T* parameters, const LossData<T>& data, T* gradient, Scratch* scratch) const;
+  /// @param gradient  n_ω elements, all written. @param record  record_size() elements, written, or null if that is 0.
+  /// @return L.
+  double Gradient(const T* parameters, const LossData<T>& data, T* gradient, Scratch* scratch, T* record = nullptr) const;
   /// @param product  n_ω elements, all written: H v. Elements of v outside `along` are ignored.
-  void HessianVector(const T* parameters, const LossData<T>& data, const T* v, T* product, Scratch* scratch) const;
+  /// @param record  of the gradient of these parameters and data, or null if record_size() is 0.
+  void HessianVector(const T* parameters, const LossData<T>& data, const T* v, T* product, Scratch* scratch, const T* record = nullptr) const;
+  /// Elements of a record; 0 unless products are made from one.
+  int64_t record_size() const { return record_size_; }
 
   const LossShape& shape() const { return shape_; }
 
@@ -92,20 +104,30 @@ class LossFunction {
   /// Of a number of rollouts.
   struct Programs {
     autodiff::Executable<T> value, gradient, hessian;
+    int64_t record_size;
   };
-  /// Rollouts first … first + count − 1.
+  /// Rollouts first … first + count − 1, whose part of a record begins at `record`.
   struct Block {
     int32_t first, count;
     size_t programs;
+    int64_t record;
   };
-  Programs Compile(const Model& model, const LossSpec& loss, int32_t rollouts, const nn::Mask& differentiated, const nn::Mask& along) const;
-  /// Runs one program of every block and sums what they write. @param v  or null. @param vector  or null. @return the sum of losses.
+  /// Which elements a program writes, and which are zero.
+  struct Written {
+    nn::Pieces pieces, rest;
+  };
+  Programs Compile(const Model& model, const LossSpec& loss, int32_t rollouts, const nn::Mask& differentiated, const nn::Mask& along,
+                   HessianProducts products) const;
+  /// Runs one program of every block. @param v, vector, record  or null. @return the sum of losses.
   double RunBlocks(autodiff::Executable<T> Programs::*program, const T* parameters, const LossData<T>& data, const T* v, T* vector,
-                   Scratch* scratch) const;
+                   T* record, Scratch* scratch) const;
+  /// Makes of what each block has written one vector.
+  void AddBlocks(const Written& written, T* vector, Scratch* scratch) const;
 
   LossShape shape_;
   int64_t size_;  // of ω
-  nn::Pieces differentiated_, undifferentiated_;
+  Written of_gradient_, of_product_;
+  int64_t record_size_ = 0;
   std::vector<Block> blocks_;
   std::vector<Programs> programs_;  // of the numbers of rollouts that blocks have
 };

@@ -73,48 +73,48 @@ class EkfSteps {
   std::vector<filter::NextSample> samples_;
 };
 
-struct MetaSeconds {
-  double adapt, maml, fomaml;
-};
-
-MetaSeconds LocalisationLearning() {
-  constexpr int kSamples = 81;  // 80 one-step predictions
-  constexpr int kSteps = 10;
-  const nssm::ModelSpec spec = benchmark::LocalisationSpec();
-  const nssm::Model model = *nssm::Model::Create(spec);
-  const nssm::LossSpec loss{.horizon = 1, .rollout = nssm::RolloutMode::kState};
-  const nssm::LossShape shape = *nssm::ShapeOfLoss(spec, loss, kSamples);
-  const data::Trajectory trajectory = nssm::RandomTrajectory(spec, 2 * kSamples, 1);
-  const auto context = nssm::CutLossData<float>(spec, loss, trajectory, 0, shape);
-  const auto target = nssm::CutLossData<float>(spec, loss, trajectory, kSamples, shape);
-  const std::vector<double> initial = model.InitialParameters(1);
-  const std::vector<float> parameters(initial.begin(), initial.end());
-  const int64_t size = model.layout().size();
-
-  MetaSeconds seconds{};
-  const nn::Mask adapted = *nn::ParseMask("encoder.5-6,transition,*_decoder", model.layout());
-  const nssm::LossFunction<float> context_loss(model, loss, shape, adapted, adapted);
-  const auto executor = base::MakeThreadExecutor(std::max(1U, std::thread::hardware_concurrency()));
-  auto scratch = context_loss.MakeScratch(executor.get());
-  std::vector<float> gradient(static_cast<size_t>(size));
-  const meta::InnerLoop<float> loop(model.layout(), adapted, meta::Optimiser::kGradientDescent, kSteps, 0,
-                                    meta::InnerRecord::kResult);
-  meta::InnerLoop<float>::Trace trace(loop, false, executor.get());
-  const std::vector<double> rates(loop.tensors(), 1e-6);
-  const auto context_gradient = [&](const float* at, float* result) { context_loss.Gradient(at, context, result, &scratch); };
-  seconds.adapt = MedianSeconds(7, [&] { loop.Run(parameters.data(), rates, context_gradient, &trace); });
-  const nn::Mask all(model.layout().tensors().size(), true);
-  for (const bool second_order : {true, false}) {
-    meta::TrainingSpec training{.loss = loss};
-    training.algorithm = second_order ? meta::Algorithm::kMaml : meta::Algorithm::kFirstOrderMaml;
-    training.inner_loop = {.steps = kSteps, .learning_rate = 1e-3};
-    const meta::MetaGradient<float> meta(model, training, shape, shape, all);
-    meta::MetaGradient<float>::Scratch meta_scratch(meta, executor.get());
-    (second_order ? seconds.maml : seconds.fomaml) = MedianSeconds(
-        5, [&] { meta.Compute(parameters.data(), context, target, gradient.data(), &meta_scratch); });
+/// Learning the localisation network from 80 one-step predictions and judging it by as many.
+class LocalisationLearning {
+ public:
+  LocalisationLearning() {
+    const nssm::ModelSpec& spec = model_.spec();
+    const data::Trajectory trajectory = nssm::RandomTrajectory(spec, 2 * kSamples, 1);
+    context_ = nssm::CutLossData<float>(spec, kLoss, trajectory, 0, shape_);
+    target_ = nssm::CutLossData<float>(spec, kLoss, trajectory, kSamples, shape_);
+    const std::vector<double> initial = model_.InitialParameters(1);
+    parameters_.assign(initial.begin(), initial.end());
   }
-  return seconds;
-}
+
+  double AdaptSeconds() const {
+    const nn::Mask adapted = *nn::ParseMask("encoder.5-6,transition,*_decoder", model_.layout());
+    const nssm::LossFunction<float> loss(model_, kLoss, shape_, adapted, adapted, nssm::HessianProducts::kNone);
+    auto scratch = loss.MakeScratch(executor_.get());
+    const meta::InnerLoop<float> loop(model_.layout(), adapted, meta::Optimiser::kGradientDescent, kSteps, 0,
+                                      meta::InnerRecord::kResult);
+    meta::InnerLoop<float>::Trace trace(loop, false, executor_.get());
+    const std::vector<double> rates(loop.tensors(), 1e-6);
+    const auto gradient = [&](int32_t, const float* at, float* result) { loss.Gradient(at, context_, result, &scratch); };
+    return MedianSeconds(7, [&] { loop.Run(parameters_.data(), rates, gradient, &trace); });
+  }
+
+  double MetaGradientSeconds(meta::Algorithm algorithm) const {
+    const nn::Mask all(model_.layout().tensors().size(), true);
+    const meta::TrainingSpec training{.loss = kLoss, .algorithm = algorithm, .inner_loop = {.steps = kSteps, .learning_rate = 1e-3}};
+    const meta::MetaGradient<float> meta(model_, training, shape_, shape_, all);
+    meta::MetaGradient<float>::Scratch scratch(meta, executor_.get());
+    std::vector<float> gradient(parameters_.size());
+    return MedianSeconds(5, [&] { meta.Compute(parameters_.data(), context_, target_, gradient.data(), &scratch); });
+  }
+
+ private:
+  static constexpr int kSamples = 81, kSteps = 10;
+  inline static const nssm::LossSpec kLoss{.horizon = 1, .rollout = nssm::RolloutMode::kState};
+  const nssm::Model model_ = *nssm::Model::Create(benchmark::LocalisationSpec());
+  const nssm::LossShape shape_ = *nssm::ShapeOfLoss(model_.spec(), kLoss, kSamples);
+  const std::unique_ptr<base::Executor> executor_ = base::MakeThreadExecutor(std::max(1U, std::thread::hardware_concurrency()));
+  nssm::LossData<float> context_, target_;
+  std::vector<float> parameters_;
+};
 
 double SmallRolloutSeconds() {
   benchmark::SmallRollout rollout(4096);
@@ -143,14 +143,16 @@ int Main(const std::string& peer_script, const std::string& json) {
   std::map<std::string, std::vector<double>> ours, peers;
   std::vector<double> one_by_one, together;
   for (int round = 0; round < (peer_script.empty() ? 1 : kRounds); ++round) {
-    const MetaSeconds learning = LocalisationLearning();
+    {
+      const LocalisationLearning learning;
+      ours["adapt_ms"].push_back(1e3 * learning.AdaptSeconds());
+      ours["maml_ms"].push_back(1e3 * learning.MetaGradientSeconds(meta::Algorithm::kMaml));
+      ours["fomaml_ms"].push_back(1e3 * learning.MetaGradientSeconds(meta::Algorithm::kFirstOrderMaml));
+    }
     {
       EkfSteps one(1);
       ours["ekf_step_us"].push_back(1e6 * MedianSeconds(2000, [&] { one.StepEach(); }));
     }
-    ours["adapt_ms"].push_back(1e3 * learning.adapt);
-    ours["maml_ms"].push_back(1e3 * learning.maml);
-    ours["fomaml_ms"].push_back(1e3 * learning.fomaml);
     ours["rollout_grad_ms"].push_back(1e3 * SmallRolloutSeconds());
     if (round == 0) ours["peak_rss_mib"].push_back(PeakRssMib());  // of what the peer does, too
     EkfSteps eight(8);

@@ -71,6 +71,28 @@ TEST(CompileTest, ScratchDoesNotGrowWithTheLengthOfAChain) {
   EXPECT_EQ(arena(20), arena(200));
 }
 
+TEST(CompileTest, SumsOfProductsAreMadeWhereTheyAreWanted) {
+  Graph g;
+  const auto square = [&g](int32_t i) { return g.Input(0, 256 * i, 16, 16); };
+  const Value sum = g.Add(g.MatMul(square(0), square(1)), g.MatMul(square(2), square(3)));
+  const Program program = Compile(g, {{sum, 1}});
+  EXPECT_EQ(program.arena_size, 0);
+  EXPECT_EQ(program.instructions.size(), 2U);
+}
+
+// A derivative's graph begins with all that it is the derivative of: here as many activations as layers, each wanted once, at the end.
+TEST(CompileTest, ValuesAreMadeShortlyBeforeTheyAreRead) {
+  const auto arena = [](int layers) {
+    Graph g;
+    std::vector<Value> made;
+    for (int i = 0; i < layers; ++i) made.push_back(g.Apply(Activation::kTanh, 0, 0, g.Input(0, 256 * i, 16, 16)));
+    Value y = g.Input(1, 0, 16, 16);
+    for (const Value v : made) y = g.Apply(Activation::kTanh, 0, 0, g.MatMul(v, y));
+    return Compile(g, {{y, 2}}).arena_size;
+  };
+  EXPECT_EQ(arena(5), arena(50));
+}
+
 TEST(CompileTest, AnOutputMayBeAnInputAConstantOrWantedTwice) {
   Graph g;
   const Value x = g.Input(0, 0, 2, 1), c = g.Constant(3, 2, 1), y = g.Add(x, c);

@@ -1,6 +1,7 @@
 metaekf_test(core/autodiff/activation_test.cc DEPS metaekf::core_autodiff)
 metaekf_test(core/autodiff/differentiate_test.cc DEPS metaekf::core_autodiff metaekf::core_base)
 metaekf_test(core/autodiff/compile_test.cc DEPS metaekf::core_autodiff metaekf::core_base)
+metaekf_test(core/autodiff/keep_test.cc DEPS metaekf::core_autodiff)
 metaekf_test(core/autodiff/kernels_test.cc DEPS metaekf::core_autodiff metaekf::core_base PkgConfig::HIGHWAY)
 metaekf_test(core/autodiff/merge_products_test.cc DEPS metaekf::core_autodiff metaekf::core_base Eigen3::Eigen)
 metaekf_test(core/autodiff/swish_theorem_test.cc DEPS metaekf::core_autodiff)

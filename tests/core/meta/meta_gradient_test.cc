@@ -91,6 +91,22 @@ TEST(MetaGradientTest, SecondOrderMatchesCentralDifferencesWithMasks) {
   }
 }
 
+// Few samples and wide layers: the inner loop's gradients record their activations.
+TEST(MetaGradientTest, SecondOrderFromRecordsMatchesCentralDifferences) {
+  for (size_t index : {size_t{0}, size_t{7}, size_t{11}}) {
+    ModelCase c = nssm::ModelCases()[index];
+    c.model.latent_size = 6;
+    c.model.encoder.hidden_widths = c.model.transition.block.hidden_widths = {14};
+    c.loss.stride = 9;  // one rollout
+    for (const char* mask : {"*", "transition,*_decoder"}) {
+      const TrainingSpec spec = Spec(c, Algorithm::kMaml, 3, 0.05);
+      const Task task = MakeTask(c);
+      EXPECT_TRUE(MetaGradient<double>(task.model, spec, task.shape, task.shape, *nn::ParseMask(mask, task.model.layout())).records());
+      EXPECT_LT(RelativeErrorAgainstDifferences(c, mask, spec, 1e-4), 1e-6) << c.name << ", mask " << mask;
+    }
+  }
+}
+
 // Adam's first steps turn with the sign of a gradient, so the differences must be finer than the gradients.
 TEST(MetaGradientTest, SecondOrderThroughAdamAndItsRatesMatchesCentralDifferences) {
   double worst = 0;

@@ -73,6 +73,34 @@ TEST(LossTest, HessianVectorProductsMatchCentralDifferencesOfTheGradient) {
   }
 }
 
+// Oracle: the same products from scratch.
+TEST(LossTest, ProductsFromARecordAreThoseFromScratch) {
+  size_t recorded = 0;
+  for (const ModelCase& c : ModelCases()) {
+    const Problem p = MakeProblem(c);
+    for (const char* text : {"*", "transition,*_decoder", "encoder"}) {
+      SCOPED_TRACE(c.name + ", along " + text);
+      const nn::Mask along = *nn::ParseMask(text, p.model.layout());
+      const LossFunction<double> scratch_loss(p.model, c.loss, p.shape, All(p.model), along);
+      const LossFunction<double> masked_loss(p.model, c.loss, p.shape, along, along, HessianProducts::kNone);
+      const LossFunction<double> recording(p.model, c.loss, p.shape, All(p.model), along, HessianProducts::kFromRecord);
+      LossFunction<double>::Scratch scratch({&scratch_loss, &masked_loss, &recording});
+      recorded += recording.record_size() > 0;
+      const size_t n = p.parameters.size();
+      base::Rng rng(1);
+      std::vector<double> v(n), expected(n), gradient(n), product(n), record(static_cast<size_t>(recording.record_size()));
+      for (double& value : v) value = rng.Normal();
+      masked_loss.Gradient(p.parameters.data(), p.data, expected.data(), &scratch);
+      recording.Gradient(p.parameters.data(), p.data, gradient.data(), &scratch, record.data());
+      for (size_t i = 0; i < n; ++i) EXPECT_NEAR(gradient[i], expected[i], 1e-14 * (1 + Norm(expected))) << "parameter " << i;
+      scratch_loss.HessianVector(p.parameters.data(), p.data, v.data(), expected.data(), &scratch);
+      recording.HessianVector(p.parameters.data(), p.data, v.data(), product.data(), &scratch, record.data());
+      for (size_t i = 0; i < n; ++i) EXPECT_NEAR(product[i], expected[i], 1e-13 * (1 + Norm(expected))) << "parameter " << i;
+    }
+  }
+  EXPECT_EQ(recorded, 3 * ModelCases().size());
+}
+
 TEST(LossTest, AMaskedGradientIsTheFullOneRestricted) {
   const ModelCase c = ModelCases().front();
   const Problem p = MakeProblem(c);

@@ -110,7 +110,9 @@ class Caller {
       wait();
       grpc::ByteBuffer answer;
       call->Read(&answer, nullptr);
-      if (wait() && response != nullptr) {
+      const bool answered = wait();
+      if (answered && method->server_streaming()) context.TryCancel();  // those of a health service go on for ever
+      if (answered && response != nullptr) {
         std::vector<grpc::Slice> slices;
         (void)answer.Dump(&slices);
         for (const grpc::Slice& part : slices)

@@ -1,0 +1,77 @@
+#include "core/autodiff/keep.h"
+
+namespace metaekf::autodiff {
+namespace {
+
+constexpr int64_t kAligned = 16;  // elements, so that each value begins a line of the cache
+
+int64_t AlignedSize(const Node& node) { return (int64_t{node.rows} * node.cols + kAligned - 1) / kAligned * kAligned; }
+
+constexpr int32_t kLeastTerms = 4;  // of the sums of a product that is dear
+
+class Keeper {
+ public:
+  Keeper(const Graph& graph, const std::vector<Output>& earlier)
+      : graph_(graph), computed_(static_cast<size_t>(graph.size()), false), seen_(computed_.size(), false) {
+    for (const Output& output : earlier) computed_[static_cast<size_t>(output.value)] = true;
+    for (Value v = graph.size() - 1; v >= 0; --v) {
+      if (!computed_[static_cast<size_t>(v)]) continue;
+      for (const Value input : graph.node(v).inputs) computed_[static_cast<size_t>(input)] = true;
+    }
+  }
+
+  /// Looks for what is dear among the values that `v` is computed from, from `v` on.
+  void Search(Value v) {
+    if (seen_[static_cast<size_t>(v)]) return;
+    seen_[static_cast<size_t>(v)] = true;
+    if (IsComputed(v) && IsDear(v)) {
+      kept_.push_back(v);
+      return;
+    }
+    for (const Value input : graph_.node(v).inputs) Search(input);
+  }
+
+  const std::vector<Value>& kept() const { return kept_; }
+
+ private:
+  /// Whatever a recurrence has gone through it can hand out.
+  bool IsComputed(Value v) const {
+    const Node& node = graph_.node(v);
+    return computed_[static_cast<size_t>(node.op == Op::kCollect ? node.inputs[0] : v)];
+  }
+
+  /// A sum is, if one of its terms is: products are added up in place.
+  bool IsDear(Value v) const {
+    const Node& node = graph_.node(v);
+    if (node.op == Op::kAdd || node.op == Op::kSub) return IsDear(node.inputs[0]) || IsDear(node.inputs[1]);
+    if (node.op == Op::kMatMul) {
+      const Node& factor = graph_.node(node.inputs[0]);
+      return (node.transpose_a ? factor.rows : factor.cols) >= kLeastTerms;
+    }
+    return node.op == Op::kCollect || node.op == Op::kFinalCarry;
+  }
+
+  const Graph& graph_;
+  std::vector<bool> computed_, seen_;
+  std::vector<Value> kept_;
+};
+
+}  // namespace
+
+std::vector<Output> ValuesToKeep(const Graph& graph, const std::vector<Output>& earlier, const std::vector<Output>& later, int32_t slot) {
+  Keeper keeper(graph, earlier);
+  for (const Output& output : later) keeper.Search(output.value);
+  std::vector<Output> kept;
+  int64_t offset = 0;
+  for (const Value v : keeper.kept()) {
+    kept.push_back({v, slot, offset});
+    offset += AlignedSize(graph.node(v));
+  }
+  return kept;
+}
+
+int64_t SizeOfKept(const Graph& graph, const std::vector<Output>& kept) {
+  return kept.empty() ? 0 : kept.back().offset + AlignedSize(graph.node(kept.back().value));
+}
+
+}  // namespace metaekf::autodiff
