@@ -46,11 +46,9 @@ absl::StatusOr<std::unique_ptr<Connection>> Connection::Open(const std::string& 
   sqlite3_busy_timeout(handle, kLockTimeoutMs);
   METAEKF_RETURN_IF_ERROR(connection->Execute("PRAGMA foreign_keys = ON"));
   METAEKF_RETURN_IF_ERROR(connection->Execute("PRAGMA synchronous = FULL"));
-  if (mode == Mode::kReadOnly) {
-    METAEKF_RETURN_IF_ERROR(connection->Execute("PRAGMA query_only = ON"));
-    // There are as many readers as there were ever at a time, and each would grow to 2 MB. What is missed the kernel has.
-    METAEKF_RETURN_IF_ERROR(connection->Execute("PRAGMA cache_size = -256"));
-  }
+  // There are as many readers as there were ever at a time, and each connection would grow to 2 MB. What is missed the kernel has.
+  METAEKF_RETURN_IF_ERROR(connection->Execute("PRAGMA cache_size = -256"));
+  if (mode == Mode::kReadOnly) METAEKF_RETURN_IF_ERROR(connection->Execute("PRAGMA query_only = ON"));
   return connection;
 }
 

@@ -115,10 +115,12 @@ std::optional<std::string> WorkerProcess::ReadLine(absl::Duration timeout, int w
 void WorkerProcess::Signal(int signal) { kill(pid_, signal); }
 
 WorkerProcess::Exit WorkerProcess::Wait() {
-  int status = 0;
-  while (waitpid(pid_, &status, 0) < 0 && errno == EINTR) {
+  siginfo_t ended;
+  while (waitid(P_PID, static_cast<id_t>(pid_), &ended, WEXITED | WNOWAIT) < 0 && errno == EINTR) {
   }
-  RemoveBatchProcess(pid_);
+  RemoveBatchProcess(pid_);  // before its number may be another's
+  int status = 0;
+  waitpid(pid_, &status, 0);
   pid_ = 0;
   if (WIFSIGNALED(status)) return {0, WTERMSIG(status)};
   return {WEXITSTATUS(status), 0};

@@ -43,28 +43,41 @@ class DiskTest : public ::testing::Test {
     ASSERT_EQ(prlimit(server_->pid(), RLIMIT_FSIZE, &limit, nullptr), 0);
   }
 
-  std::unique_ptr<client::EstimationSession> Open(client::Client& client, size_t max_kept = client::EstimationOptions().max_kept) {
+  /// A session, and what has come of it.
+  struct Stream {
+    std::unique_ptr<client::EstimationSession> session;
+    uint64_t next = 1;
+    metaekf::testing::EstimateDigest digest;
+  };
+
+  Stream Open(client::Client& client, size_t max_kept = client::EstimationOptions().max_kept) {
     client::EstimationOptions options;
     options.max_kept = max_kept;
     options.target.model = "robot";
     options.covariance = client::CovarianceFormat::kLowerTriangle;
     auto session = client.OpenEstimation(options);
     EXPECT_TRUE(session.ok()) << session.status().message;
-    return session.ok() ? std::move(*session) : nullptr;
+    return {.session = session.ok() ? std::move(*session) : nullptr};
   }
 
-  /// Sends sample by sample, from `next` on, while `more` says so of each answer.
-  void Stream(client::EstimationSession& session, uint64_t* next, metaekf::testing::EstimateDigest* digest,
-              const std::function<bool(const client::EstimateBatch&)>& more) {
+  /// Sends sample by sample while `more` says so of each answer.
+  static void Send(Stream& stream, const std::function<bool(const client::EstimateBatch&)>& more) {
+    ASSERT_NE(stream.session, nullptr);
     while (true) {
-      ASSERT_TRUE(session.Send(metaekf::testing::SignalSamples(0, *next, 1)).ok());
-      const auto batch = session.Receive();
+      ASSERT_TRUE(stream.session->Send(metaekf::testing::SignalSamples(0, stream.next, 1)).ok());
+      const auto batch = stream.session->Receive();
       ASSERT_TRUE(batch.ok() && batch->has_value()) << batch.status().message;
-      ASSERT_EQ((*batch)->first_seq, *next);
-      digest->Add(**batch);
-      ++*next;
+      ASSERT_EQ((*batch)->first_seq, stream.next);
+      stream.digest.Add(**batch);
+      ++stream.next;
       if (!more(**batch)) return;
     }
+  }
+  static void SendUpTo(uint64_t end, Stream& stream) {
+    Send(stream, [&](const auto&) { return stream.next < end; });
+  }
+  static void SendUntilSomethingIsDurable(Stream& stream) {
+    Send(stream, [](const auto& batch) { return batch.durable_seq == 0; });
   }
 
   /// How long the oldest sample has waited to become durable.
@@ -72,14 +85,11 @@ class DiskTest : public ::testing::Test {
   /// Calls that the server has refused for want of room.
   double Refused() const { return Metric(address_, "metaekf_calls_total", {{"code", "RESOURCE_EXHAUSTED"}}); }
 
-  void ExpectUndisturbed(uint64_t samples, const metaekf::testing::EstimateDigest& digest) {
+  void ExpectUndisturbed(const Stream& stream) {
     client::Client client = Connect();
-    const auto session = Open(client);
-    ASSERT_NE(session, nullptr);
-    metaekf::testing::EstimateDigest expected;
-    uint64_t next = 1;
-    Stream(*session, &next, &expected, [&](const auto&) { return next <= samples; });
-    EXPECT_EQ(digest.value(), expected.value()) << "over " << samples << " samples";
+    Stream undisturbed = Open(client);
+    SendUpTo(stream.next, undisturbed);
+    EXPECT_EQ(stream.digest.value(), undisturbed.digest.value()) << "before sample " << stream.next;
   }
 
   store::TempDirectory directory_;
@@ -90,18 +100,15 @@ class DiskTest : public ::testing::Test {
 
 TEST_F(DiskTest, AFullDiskStopsNoStreamAndPasses) {
   client::Client client = Connect();
-  const auto session = Open(client);
-  ASSERT_NE(session, nullptr);
-  metaekf::testing::EstimateDigest digest;
-  uint64_t next = 1;
-  Stream(*session, &next, &digest, [](const auto& batch) { return batch.durable_seq == 0; });
+  Stream stream = Open(client);
+  SendUntilSomethingIsDurable(stream);
 
   SetFull(true);
-  const uint64_t full_since = next;
+  const uint64_t full_since = stream.next;
   uint64_t durable = 0;
-  Stream(*session, &next, &digest, [&](const auto& batch) {
+  Send(stream, [&](const auto& batch) {
     durable = batch.durable_seq;
-    return next % 100 != 0 || CheckpointLag() < 0.3;  // several commits have failed
+    return stream.next % 100 != 0 || CheckpointLag() < 0.3;  // several commits have failed
   });
   EXPECT_LT(durable, full_since) << "nothing is durable that is not on the disk";
   const auto refused = Connect().ImportModel("robot", model_);
@@ -111,18 +118,15 @@ TEST_F(DiskTest, AFullDiskStopsNoStreamAndPasses) {
   EXPECT_TRUE(Connect().ListModels().ok()) << "what is there is served";
 
   SetFull(false);
-  Stream(*session, &next, &digest, [&](const auto& batch) { return batch.durable_seq < full_since; });
-  ExpectUndisturbed(next - 1, digest);
+  Send(stream, [&](const auto& batch) { return batch.durable_seq < full_since; });
+  ExpectUndisturbed(stream);
   EXPECT_EQ(server_->End(SIGTERM).code, 0);
 }
 
 TEST_F(DiskTest, AStreamWhoseServerComesBackToAFullDiskWaitsForRoom) {
   client::Client client = Connect();
-  const auto session = Open(client);
-  ASSERT_NE(session, nullptr);
-  metaekf::testing::EstimateDigest digest;
-  uint64_t next = 1;
-  Stream(*session, &next, &digest, [](const auto& batch) { return batch.durable_seq == 0; });
+  Stream stream = Open(client);
+  SendUntilSomethingIsDurable(stream);
   server_->End(SIGKILL);
   StartServer();
   SetFull(true);
@@ -130,66 +134,54 @@ TEST_F(DiskTest, AStreamWhoseServerComesBackToAFullDiskWaitsForRoom) {
     while (Refused() == 0 && !HasFailure()) std::this_thread::yield();
     SetFull(false);
   });
-  const uint64_t end = next + 100;
-  Stream(*session, &next, &digest, [&](const auto&) { return next < end; });
+  SendUpTo(stream.next + 100, stream);
   operator_.join();
-  ExpectUndisturbed(next - 1, digest);
+  ExpectUndisturbed(stream);
 }
 
 TEST_F(DiskTest, AClientThatKeepsAsMuchAsItMaySendsOn) {
   client::Client client = Connect();
-  const auto session = Open(client, /*max_kept=*/256);
-  ASSERT_NE(session, nullptr);
-  metaekf::testing::EstimateDigest digest;
-  uint64_t next = 1;
-  Stream(*session, &next, &digest, [](const auto& batch) { return batch.durable_seq == 0; });
+  Stream stream = Open(client, /*max_kept=*/256);
+  SendUntilSomethingIsDurable(stream);
   SetFull(true);  // nothing becomes durable any more
-  const uint64_t end = next + 64 * 100;
-  std::thread sender([&, seq = next]() mutable {
-    for (; seq < end; seq += 64) ASSERT_TRUE(session->Send(metaekf::testing::SignalSamples(0, seq, 64)).ok());
+  const uint64_t end = stream.next + 64 * 100;
+  std::thread sender([&, seq = stream.next]() mutable {
+    for (; seq < end; seq += 64) ASSERT_TRUE(stream.session->Send(metaekf::testing::SignalSamples(0, seq, 64)).ok());
   });
-  while (next < end) {
-    const auto batch = session->Receive();
+  while (stream.next < end) {
+    const auto batch = stream.session->Receive();
     ASSERT_TRUE(batch.ok() && batch->has_value()) << batch.status().message;
-    digest.Add(**batch);
-    next += (*batch)->samples;
+    stream.digest.Add(**batch);
+    stream.next += (*batch)->samples;
   }
   sender.join();
   SetFull(false);
-  ExpectUndisturbed(next - 1, digest);
+  ExpectUndisturbed(stream);
 }
 
 TEST_F(DiskTest, AServerKilledOnAFullDiskLosesNothing) {
   client::Client client = Connect();
-  const auto session = Open(client);
-  ASSERT_NE(session, nullptr);
-  metaekf::testing::EstimateDigest digest;
-  uint64_t next = 1;
+  Stream stream = Open(client);
   for (int round = 0; round < 3; ++round) {
-    Stream(*session, &next, &digest, [](const auto& batch) { return batch.durable_seq == 0; });
+    SendUntilSomethingIsDurable(stream);
     SetFull(true);
-    const uint64_t until = next + 300;
-    Stream(*session, &next, &digest, [&](const auto&) { return next < until; });
+    SendUpTo(stream.next + 300, stream);
     server_->End(SIGKILL);
     StartServer();
   }
-  const uint64_t until = next + 100;
-  Stream(*session, &next, &digest, [&](const auto&) { return next < until; });
-  ExpectUndisturbed(next - 1, digest);
+  SendUpTo(stream.next + 100, stream);
+  ExpectUndisturbed(stream);
 }
 
 TEST_F(DiskTest, ADamagedCheckpointIsToldAndTheOtherSessionsGoOn) {
   client::Client client = Connect();
   std::vector<client::SessionInfo> infos;
-  std::vector<uint64_t> next(4, 1);
-  std::vector<metaekf::testing::EstimateDigest> digests(4);
   for (size_t s = 0; s < 4; ++s) {
-    const auto session = Open(client);
-    ASSERT_NE(session, nullptr);
-    infos.push_back(session->info());
-    Stream(*session, &next[s], &digests[s], [&](const auto&) { return next[s] <= 20; });
-    session->FinishSending();
-    ASSERT_TRUE(session->Receive().ok());
+    Stream stream = Open(client);
+    SendUpTo(21, stream);
+    infos.push_back(stream.session->info());
+    stream.session->FinishSending();
+    ASSERT_TRUE(stream.session->Receive().ok());
   }
   ASSERT_EQ(server_->End(SIGTERM).code, 0);
 

@@ -10,6 +10,7 @@
 #include "core/experiments/bouc_wen_data.h"
 #include "core/experiments/bouc_wen_learners.h"
 #include "core/experiments/learner.h"
+#include "tests/support/sanitized.h"
 
 namespace metaekf::experiments {
 namespace {
@@ -41,7 +42,7 @@ class EveryExperiment : public ::testing::TestWithParam<std::string> {
 };
 
 TEST_P(EveryExperiment, RunsEndToEndAndTheSameOnAnyNumberOfThreads) {
-  const Report report = RunTiny(experiment(), 1);
+  const Report report = RunTiny(experiment(), 2);
   ASSERT_FALSE(report.tables.empty());
   ASSERT_FALSE(report.pictures.empty());
   EXPECT_FALSE(report.findings.empty());
@@ -57,7 +58,8 @@ TEST_P(EveryExperiment, RunsEndToEndAndTheSameOnAnyNumberOfThreads) {
     EXPECT_THAT(picture.svg, StartsWith("<svg"));
     EXPECT_EQ(picture.svg.find("nan"), std::string::npos);
   }
-  EXPECT_EQ(WithoutTimes(report), WithoutTimes(RunTiny(experiment(), 2)));
+  if (METAEKF_SANITIZED) return;  // nothing is to be found by going the same way again
+  EXPECT_EQ(WithoutTimes(report), WithoutTimes(RunTiny(experiment(), 1)));
 }
 
 TEST_P(EveryExperiment, EveryLearnerOfEveryBudgetHasASpecificationThatIsAccepted) {

@@ -3,6 +3,7 @@
 
 #include "core/meta/meta_gradient.h"
 #include "tests/core/nssm/random_models.h"
+#include "tests/support/sanitized.h"
 
 namespace metaekf::meta {
 namespace {
@@ -40,9 +41,7 @@ Measured Measure(int32_t steps) {
 
 // The whole memory of a meta-gradient is its scratch: Compute allocates nothing.
 TEST(MetaMemoryTest, FortyInnerStepsCostFortyParameterVectorsAndNoGraphs) {
-#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-  GTEST_SKIP() << "the sanitizers' malloc does not tell what is in use";
-#endif
+  if (METAEKF_SANITIZED) GTEST_SKIP() << "the sanitizers' malloc does not tell what is in use";
   const Measured one = Measure(1), forty = Measure(40);
   EXPECT_LE(forty.scratch, one.scratch + 40 * (one.vector + one.gradient));
   // The bound with activations is generous; without any the 39 further iterates alone remain.
