@@ -40,6 +40,7 @@ constexpr int kCopyFromTiles = 4;  // tiles of a strip from which on a copy of i
 constexpr int kDotMaxColumns = 12;
 constexpr int kDotMinDepthVectors = 4;
 constexpr int kToRead = 0, kToWrite = 1, kSecondLevel = 2, kFirstLevel = 3;  // of __builtin_prefetch
+constexpr int kLongWay = 32;  // steps of k, while which what a tile is written to arrives
 constexpr int kLine = 64;  // bytes of the cache
 
 /// A matrix that is read by single elements: element (row, column) is at[row · by_row + column · by_column].
@@ -72,6 +73,9 @@ HWY_INLINE void Tile(D d, int rows, int k, const T* HWY_RESTRICT a, ptrdiff_t ld
   for (int j = 0; j < kColumns; ++j) {
     METAEKF_UNROLL
     for (int i = 0; i < kVectors; ++i) sums[j][i] = hn::Zero(d);
+  }
+  METAEKF_UNROLL
+  for (int j = 0; k >= kLongWay && j < kColumns; ++j) {
     METAEKF_UNROLL
     for (int i = 0; i < kVectors; ++i) __builtin_prefetch(c.at + j * c.ld + i * lanes, kToWrite, kFirstLevel);
   }
