@@ -5,9 +5,9 @@ namespace {
 
 constexpr int64_t kAligned = 16;  // elements, so that each value begins a line of the cache
 
-int64_t AlignedSize(const Node& node) { return (int64_t{node.rows} * node.cols + kAligned - 1) / kAligned * kAligned; }
+constexpr int32_t kLeastTerms = 4;   // of the sums of a product that is dear
 
-constexpr int32_t kLeastTerms = 4;  // of the sums of a product that is dear
+int64_t AlignedSize(const Node& node) { return (int64_t{node.rows} * node.cols + kAligned - 1) / kAligned * kAligned; }
 
 class Keeper {
  public:
