@@ -8,6 +8,7 @@
 #include <fstream>
 #include <iterator>
 #include <memory>
+#include <string_view>
 #include <vector>
 
 #include "absl/strings/ascii.h"
@@ -67,6 +68,12 @@ absl::StatusOr<MatArray> ToArray(const matvar_t& array) {
   return read;
 }
 
+/// Whether a file is HDF5 after a block of MATLAB's: matio tries anything else as version 4 and makes room for whatever that says.
+bool IsMat73(std::string_view bytes) {
+  constexpr size_t kUserBlock = 512;
+  return bytes.size() > kUserBlock && bytes.substr(kUserBlock).starts_with("\x89HDF\r\n\x1a\n");
+}
+
 /// Reads what ReadMat5 does of a file of version 7.3, which is HDF5.
 absl::StatusOr<std::vector<MatArray>> ReadMat73(const std::string& path, size_t file_size) {
   const std::unique_ptr<mat_t, Close> file(Mat_Open(path.c_str(), MAT_ACC_RDONLY));
@@ -94,7 +101,9 @@ absl::StatusOr<std::vector<MatArray>> ReadMat73(const std::string& path, size_t 
 
 absl::StatusOr<std::vector<MatArray>> ReadArrays(std::istream& file, const std::string& path) {
   const std::string bytes{std::istreambuf_iterator<char>(file), {}};
-  return IsMat5(bytes) ? ReadMat5(bytes) : ReadMat73(path, bytes.size());
+  if (IsMat5(bytes)) return ReadMat5(bytes);
+  if (IsMat73(bytes)) return ReadMat73(path, bytes.size());
+  return absl::InvalidArgumentError("not a MAT file of version 5 or 7.3");
 }
 
 /// One column of the CSV: a row or column of an array.

@@ -176,6 +176,9 @@ TEST(MatFileNamesTest, WhatIsNoMatFileIsSaid) {
   EXPECT_TRUE(IsMatFile("a/B.MAT"));
   EXPECT_FALSE(IsMatFile("mat.csv"));
   EXPECT_THAT(std::string(ReadMatFileAsCsv(TempFile("n.mat", "u1,y1\n0,0\n")).status().message()), HasSubstr("not a MAT file"));
+  // Of version 4, and says that it is huge.
+  const std::string version_4 = std::string(4, '\0') + std::string(96, 'u');
+  EXPECT_THAT(std::string(ReadMatFileAsCsv(TempFile("v4.mat", version_4)).status().message()), HasSubstr("not a MAT file of version 5 or 7.3"));
   const auto missing = ReadMatFileAsCsv("/no/such.mat");
   EXPECT_EQ(missing.status().code(), absl::StatusCode::kNotFound);
 }
