@@ -74,10 +74,12 @@ HWY_INLINE void Tile(D d, int rows, int k, const T* HWY_RESTRICT a, ptrdiff_t ld
     METAEKF_UNROLL
     for (int i = 0; i < kVectors; ++i) sums[j][i] = hn::Zero(d);
   }
-  METAEKF_UNROLL
-  for (int j = 0; k >= kLongWay && j < kColumns; ++j) {
+  if (k >= kLongWay) {
     METAEKF_UNROLL
-    for (int i = 0; i < kVectors; ++i) __builtin_prefetch(c.at + j * c.ld + i * lanes, kToWrite, kFirstLevel);
+    for (int j = 0; j < kColumns; ++j) {
+      METAEKF_UNROLL
+      for (int i = 0; i < kVectors; ++i) __builtin_prefetch(c.at + j * c.ld + i * lanes, kToWrite, kFirstLevel);
+    }
   }
   const T* b_row = b.at;
   for (int l = 0; l < k; ++l, a += lda, b_row += b.by_row, ahead.at += ahead.by) {
