@@ -1,13 +1,13 @@
 #include "core/autodiff/keep.h"
 
+#include "core/autodiff/arena_allocator.h"
+
 namespace metaekf::autodiff {
 namespace {
 
-constexpr int64_t kAligned = 16;  // elements, so that each value begins a line of the cache
+constexpr int32_t kLeastTerms = 4;  // of the sums of a product that is dear
 
-constexpr int32_t kLeastTerms = 4;   // of the sums of a product that is dear
-
-int64_t AlignedSize(const Node& node) { return (int64_t{node.rows} * node.cols + kAligned - 1) / kAligned * kAligned; }
+int64_t AlignedSize(const Node& node) { return Aligned(int64_t{node.rows} * node.cols); }
 
 class Keeper {
  public:
