@@ -56,18 +56,50 @@ class Keeper {
   std::vector<Value> kept_;
 };
 
+std::vector<Output> OneAfterTheOther(const Graph& graph, const std::vector<Value>& values, int32_t slot) {
+  std::vector<Output> outputs;
+  int64_t offset = 0;
+  for (const Value v : values) {
+    outputs.push_back({v, slot, offset});
+    offset += AlignedSize(graph.node(v));
+  }
+  return outputs;
+}
+
 }  // namespace
 
 std::vector<Output> ValuesToKeep(const Graph& graph, const std::vector<Output>& earlier, const std::vector<Output>& later, int32_t slot) {
   Keeper keeper(graph, earlier);
   for (const Output& output : later) keeper.Search(output.value);
-  std::vector<Output> kept;
-  int64_t offset = 0;
-  for (const Value v : keeper.kept()) {
-    kept.push_back({v, slot, offset});
-    offset += AlignedSize(graph.node(v));
+  return OneAfterTheOther(graph, keeper.kept(), slot);
+}
+
+std::vector<Output> ValuesFromSlot(const Graph& graph, const std::vector<Output>& outputs, int32_t from, int32_t slot) {
+  const auto size = static_cast<size_t>(graph.size());
+  std::vector<bool> follows(size), has_product(size), wanted(size, false);
+  for (Value v = 0; v < graph.size(); ++v) {
+    const auto at = static_cast<size_t>(v);
+    const Node& node = graph.node(v);
+    const bool recurs = node.op == Op::kScan || node.op == Op::kCollect || node.op == Op::kFinalCarry;
+    follows[at] = node.op == Op::kInput ? node.slot == from : !recurs;
+    has_product[at] = node.op == Op::kMatMul;
+    for (const Value input : node.inputs) {
+      follows[at] = follows[at] && follows[static_cast<size_t>(input)];
+      has_product[at] = has_product[at] || has_product[static_cast<size_t>(input)];
+    }
   }
-  return kept;
+  for (const Output& output : outputs) wanted[static_cast<size_t>(output.value)] = true;
+  std::vector<Value> last;
+  for (Value v = graph.size() - 1; v >= 0; --v) {
+    const auto at = static_cast<size_t>(v);
+    if (!wanted[at]) continue;
+    if (follows[at]) {
+      if (has_product[at]) last.push_back(v);
+      continue;
+    }
+    for (const Value input : graph.node(v).inputs) wanted[static_cast<size_t>(input)] = true;
+  }
+  return OneAfterTheOther(graph, last, slot);
 }
 
 int64_t SizeOfKept(const Graph& graph, const std::vector<Output>& kept) {

@@ -18,6 +18,12 @@ namespace metaekf::autodiff {
 /// (Graph::TurnIntoInput).
 std::vector<Output> ValuesToKeep(const Graph& graph, const std::vector<Output>& earlier, const std::vector<Output>& later, int32_t slot);
 
+/// Values behind products that follow from one input slot and constants alone, the last before others join them: computed once, they serve
+/// many runs in which the slot holds the same. The derivative of an affine layer by its input is one, for which a slot of weights suffices.
+///
+/// @param outputs  of the program that is run often. @param from  the slot. @param slot, return  as those of ValuesToKeep.
+std::vector<Output> ValuesFromSlot(const Graph& graph, const std::vector<Output>& outputs, int32_t from, int32_t slot);
+
 /// Elements that they take.
 int64_t SizeOfKept(const Graph& graph, const std::vector<Output>& kept);
 

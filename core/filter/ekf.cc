@@ -48,14 +48,19 @@ void CholeskyInPlace(Ref<MatrixXd> a) {
   }
 }
 
-/// A ← R Rᵀ; of a triangular R only the lower triangle is read.
-void Square(const Ref<const MatrixXd>& root, bool triangular, MatrixXd* a) {
-  const Index n = root.rows();
+/// A ← D R Rᵀ D with D = diag(scale), n × n; of a triangular R only the lower triangle is read.
+/// @param root  R, at least n rows, of which the first n are taken.
+void ScaledSquare(const MatrixXd& root, bool triangular, const VectorXd& scale, MatrixXd* a) {
+  const Index n = scale.size(), cols = triangular ? n : root.cols();
   for (Index j = 0; j < n; ++j) {
-    auto below = a->col(j).tail(n - j);
-    below.setZero();
-    for (Index k = 0; k < (triangular ? j + 1 : root.cols()); ++k) below += root(j, k) * root.col(k).tail(n - j);
-    a->row(j).tail(n - j) = below.transpose();
+    double* const below = &(*a)(0, j);
+    for (Index i = j; i < n; ++i) below[i] = 0;
+    for (Index k = 0; k < (triangular ? j + 1 : cols); ++k) {
+      const double* const column = &root(0, k);
+      const double factor = column[j];
+      for (Index i = j; i < n; ++i) below[i] += factor * column[i];
+    }
+    for (Index i = j; i < n; ++i) (*a)(j, i) = below[i] *= scale[i] * scale[j];
   }
 }
 
@@ -170,7 +175,7 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
   ekf.H_rows_.resize(n_y, joint);
   ekf.time_work_.resize(joint, 2 * joint);
   ekf.update_work_.resize(joint + n_y, joint + n_y);
-  ekf.product_.resize(std::max(n, n_y), joint);
+  ekf.output_factor_.resize(n_y, joint);
   return ekf;
 }
 
@@ -439,19 +444,13 @@ void Ekf::Describe(const VectorXd& mean, const MatrixXd& factor, const VectorXd&
 /// In Case I from h and H at the mean.
 void Ekf::WriteEstimate(const VectorXd& mean, const MatrixXd& factor, Estimate* estimate) {
   const data::ChannelScaling& scaling = case_one_ ? normaliser_.outputs : normaliser_.states;
-  auto root = product_.topRows(estimate_size());
-  if (case_one_) {
-    estimate->mean = h_.cwiseProduct(scaling.scale) + scaling.mean;
-    root.noalias() = H_.lazyProduct(factor);
-  } else {
-    estimate->mean = mean.head(model_size_).cwiseProduct(scaling.scale) + scaling.mean;
-    root = factor.topRows(model_size_);
-  }
+  const VectorXd& of = case_one_ ? h_ : mean;
+  for (Index i = 0; i < estimate_size(); ++i) estimate->mean[i] = of[i] * scaling.scale[i] + scaling.mean[i];
   if (set_ && projection_ != Projection::kNone && estimate->mean.allFinite() && !physics::Contains(*set_, estimate->mean)) {
     estimate->mean = physics::Inside(*set_, estimate->mean);  // rounding has put it outside
   }
-  for (Index i = 0; i < root.rows(); ++i) root.row(i) *= scaling.scale[i];
-  Square(root, /*triangular=*/!case_one_, &estimate->cov);
+  if (case_one_) output_factor_.noalias() = H_.lazyProduct(factor);
+  ScaledSquare(case_one_ ? output_factor_ : factor, /*triangular=*/!case_one_, scaling.scale, &estimate->cov);
 }
 
 void Ekf::PutInside(FilterModel::Scratch* scratch, Estimate* estimate) {

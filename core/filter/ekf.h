@@ -217,7 +217,7 @@ class Ekf {
   Eigen::VectorXd u_, y_, value_, latent_, h_, whitened_;
   std::vector<Eigen::Index> measured_;  // components of y, those that are
   Eigen::Index updated_ = 0;            // components in the last UpdateFactor
-  Eigen::MatrixXd F_, H_, H_rows_, time_work_, update_work_, product_, prior_factor_;
+  Eigen::MatrixXd F_, H_, H_rows_, time_work_, update_work_, output_factor_, prior_factor_;
 };
 
 }  // namespace metaekf::filter

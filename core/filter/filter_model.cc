@@ -2,10 +2,12 @@
 
 #include <algorithm>
 #include <array>
+#include <type_traits>
 
 #include "absl/container/inlined_vector.h"
 #include "core/autodiff/differentiate.h"
 #include "core/autodiff/evaluate.h"
+#include "core/autodiff/keep.h"
 #include "core/autodiff/packed_weights.h"
 #include "core/filter/unknown_directions.h"
 #include "core/nssm/start_fit.h"
@@ -25,24 +27,27 @@ using Eigen::VectorXd;
 constexpr size_t kMostTogether = 8;  // points: with more, columns are no longer few
 constexpr int64_t kLarge = 1 << 15;  // parameters, which no longer stay in the first cache
 
-enum Slot : int32_t { kParameters, kState, kInput, kDirection, kValueOut, kJacobianOut };
+enum Slot : int32_t { kParameters, kState, kInput, kDirection, kPrepared, kValueOut, kJacobianOut };
 
 enum Function : size_t { kTransition, kMeasurement, kReconstruction, kFunctions };
 
 /// Of each function of state and input its value with the Jacobian by the state, and its derivative along one direction of the parameters.
 struct Programs {
+  /// What follows from the parameters alone, for `with_jacobian` to read.
+  std::array<autodiff::Program, kFunctions> prepare;
+  std::array<int64_t, kFunctions> prepared_size{};
   std::array<autodiff::Program, kFunctions> with_jacobian, along;
   autodiff::Program encode;
 };
 
 /// value(x, u) and its derivative along every component of x at once.
-autodiff::Program WithJacobian(Graph* graph, Value value, Value state) {
+std::vector<autodiff::Output> WithJacobian(Graph* graph, Value value, Value state) {
   const int32_t n = graph->node(state).rows;
   std::vector<double> identity(static_cast<size_t>(n) * static_cast<size_t>(n), 0);
   for (int32_t i = 0; i < n; ++i) identity[static_cast<size_t>(i) * static_cast<size_t>(n + 1)] = 1;
   Value jacobian = autodiff::Jvp(graph, {{state, graph->ConstantData(std::move(identity), n, n)}}, {value}, n)[0];
   if (jacobian == kNoValue) jacobian = graph->Constant(0, graph->node(value).rows, n);
-  return autodiff::Compile(*graph, {{value, kValueOut}, {jacobian, kJacobianOut}});
+  return {{value, kValueOut}, {jacobian, kJacobianOut}};
 }
 
 Programs BuildPrograms(const nssm::Model& model, int32_t n) {
@@ -56,7 +61,12 @@ Programs BuildPrograms(const nssm::Model& model, int32_t n) {
       const Value state = graph.Input(kState, 0, n, 1);
       const Value value = function(parts, state, spec.input_size > 0 ? graph.Input(kInput, 0, spec.input_size, 1) : kNoValue);
       if (!by_parameters) {
-        programs.with_jacobian[which] = WithJacobian(&graph, value, state);
+        const std::vector<autodiff::Output> outputs = WithJacobian(&graph, value, state);
+        const std::vector<autodiff::Output> prepared = autodiff::ValuesFromSlot(graph, outputs, kParameters, kPrepared);
+        programs.prepare[which] = autodiff::Compile(graph, prepared);
+        programs.prepared_size[which] = autodiff::SizeOfKept(graph, prepared);
+        for (const autodiff::Output& output : prepared) graph.TurnIntoInput(output.value, output.slot, output.offset);
+        programs.with_jacobian[which] = autodiff::Compile(graph, outputs);
         continue;
       }
       const nn::ParameterValues direction = nn::BindParameters(model.layout(), kDirection, &graph);
@@ -96,6 +106,9 @@ class TypedFilterModel : public FilterModel {
  public:
   TypedFilterModel(Programs programs, const nssm::Bundle& bundle, int32_t state_size)
       : model_(bundle.model),
+        prepare_{Executable<T>(std::move(programs.prepare[kTransition])), Executable<T>(std::move(programs.prepare[kMeasurement])),
+                 Executable<T>(std::move(programs.prepare[kReconstruction]))},
+        prepared_size_(programs.prepared_size),
         with_jacobian_{Executable<T>(std::move(programs.with_jacobian[kTransition])), Executable<T>(std::move(programs.with_jacobian[kMeasurement])),
                        Executable<T>(std::move(programs.with_jacobian[kReconstruction]))},
         along_{Executable<T>(std::move(programs.along[kTransition])), Executable<T>(std::move(programs.along[kMeasurement])),
@@ -117,7 +130,12 @@ class TypedFilterModel : public FilterModel {
                           kParameters, typed->values.data(), other == nullptr ? nullptr : &*other->packed);
     std::vector<bool> unknown(typed->values.size(), false);
     for (Eigen::Index i = 0; i < directions.rows(); ++i) unknown[static_cast<size_t>(i)] = directions.cols() > 0 && (directions.row(i).array() != 0).any();
-    for (size_t function = 0; function < kFunctions; ++function) typed->known[function] = typed->packed->Without(function, unknown);
+    const Arena<T> arena(Executables());
+    for (size_t function = 0; function < kFunctions; ++function) {
+      typed->known[function] = typed->packed->Without(function, unknown);
+      typed->prepared[function].resize(prepared_size_[function]);
+      PrepareValues(function, typed->values.data(), typed->prepared[function].data(), arena);
+    }
     return typed;
   }
 
@@ -167,14 +185,17 @@ class TypedFilterModel : public FilterModel {
     Matrix along;  // V
     std::optional<autodiff::PackedWeights<T>> packed;
     std::array<Factors, kFunctions> known;  // of weights that V leaves alone
+    std::array<Vector, kFunctions> prepared;
     std::vector<double> exact;  // for StartFit
   };
   /// What a point is evaluated with.
   struct Lane {
     explicit Lane(const TypedFilterModel& owner) : argument(owner.argument_size_), input(owner.input_size_), value(owner.value_size_),
-                                                   jacobian(int64_t{owner.value_size_} * owner.state_size_) {}
+                                                   jacobian(int64_t{owner.value_size_} * owner.state_size_),
+                                                   prepared(*std::max_element(owner.prepared_size_.begin(), owner.prepared_size_.end())) {}
     Vector parameters;  // ω̂ + V z
     Vector argument, input, value, jacobian;
+    Vector prepared;  // of `parameters`
   };
   struct TypedScratch : Scratch {
     explicit TypedScratch(const TypedFilterModel& owner) : arena(owner.Executables(), owner.lanes()), lanes(owner.lanes(), Lane(owner)) {
@@ -195,7 +216,14 @@ class TypedFilterModel : public FilterModel {
     std::vector<const Executable<T>*> all{&encode_};
     for (const Executable<T>& executable : with_jacobian_) all.push_back(&executable);
     for (const Executable<T>& executable : along_) all.push_back(&executable);
+    for (const Executable<T>& executable : prepare_) all.push_back(&executable);
     return all;
+  }
+
+  void PrepareValues(size_t function, const T* parameters, T* prepared, const Arena<T>& arena) const {
+    Slots<T> slots;
+    slots.Input(kParameters, parameters).Output(kPrepared, prepared);
+    autodiff::Evaluate(prepare_[function], slots, arena);
   }
 
   /// @param rows  of the function's value.
@@ -204,47 +232,68 @@ class TypedFilterModel : public FilterModel {
     while (!points.empty()) {
       const std::span<const Point> together = points.first(std::min(points.size(), s.lanes.size()));
       absl::InlinedVector<autodiff::Run<T>, kMostTogether> runs;
-      for (size_t i = 0; i < together.size(); ++i) runs.push_back(Begin(function, together[i], &s.lanes[i]));
+      for (size_t i = 0; i < together.size(); ++i) runs.push_back(Begin(function, rows, together[i], &s.lanes[i], s.arena));
       autodiff::EvaluateTogether(with_jacobian_[function], std::span<const autodiff::Run<T>>(runs), s.arena);
       for (size_t i = 0; i < together.size(); ++i) Finish(function, rows, together[i], &runs[i].slots, &s.lanes[i], s.arena);
       points = points.subspan(together.size());
     }
   }
 
-  autodiff::Run<T> Begin(Function function, const Point& point, Lane* lane) const {
+  // Programs read and write the caller's own memory where its numbers are of their kind, else the lane's.
+  static constexpr bool kSame = std::is_same_v<T, double>;
+  static const T* In(const double* from, Eigen::Index size, Vector* copy) {
+    if constexpr (kSame) return from;
+    copy->head(size) = Eigen::Map<const VectorXd>(from, size).template cast<T>();
+    return copy->data();
+  }
+  static T* Out(double* to, Vector* instead) {
+    if constexpr (kSame) return to;
+    return instead->data();
+  }
+  static void BringBack(const T* made, Eigen::Index size, double* to) {
+    if constexpr (!kSame) std::copy_n(made, size, to);
+  }
+  static bool IsWhole(const MatrixXd& jacobian, Eigen::Index rows) { return kSame && jacobian.rows() == rows; }
+
+  autodiff::Run<T> Begin(Function function, Eigen::Index rows, const Point& point, Lane* lane, const Arena<T>& arena) const {
     const TypedParameters& typed = static_cast<const TypedParameters&>(*point.parameters);
     const Eigen::Index n = state_size_, r = point.x.size() - n;
-    lane->argument.head(n) = point.x.head(n).template cast<T>();
-    lane->input.head(point.u.size()) = point.u.template cast<T>();
     const T* omega = typed.values.data();
+    const T* prepared = typed.prepared[function].data();
     if (r > 0) {
       lane->parameters = Eigen::Map<const Vector>(omega, model_.layout().size());
       for (Eigen::Index k = 0; k < r; ++k) lane->parameters += static_cast<T>(point.x[n + k]) * typed.along.col(k);
       omega = lane->parameters.data();
+      PrepareValues(function, omega, lane->prepared.data(), arena);
+      prepared = lane->prepared.data();
     }
     autodiff::Run<T> run{.packed = r > 0 ? &typed.known[function] : &typed.packed->Of(function)};
     run.slots.Input(kParameters, omega)
-        .Input(kState, lane->argument.data())
-        .Input(kInput, lane->input.data())
-        .Output(kValueOut, lane->value.data())
-        .Output(kJacobianOut, lane->jacobian.data());
+        .Input(kState, In(point.x.data(), n, &lane->argument))
+        .Input(kInput, In(point.u.data(), point.u.size(), &lane->input))
+        .Input(kPrepared, prepared)
+        .Output(kValueOut, Out(point.value->data(), &lane->value))
+        .Output(kJacobianOut, IsWhole(*point.jacobian, rows) ? Out(point.jacobian->data(), &lane->jacobian) : lane->jacobian.data());
     return run;
   }
 
   void Finish(Function function, Eigen::Index rows, const Point& point, Slots<T>* slots, Lane* lane, const Arena<T>& arena) const {
     const TypedParameters& typed = static_cast<const TypedParameters&>(*point.parameters);
     const Eigen::Index n = state_size_, r = point.x.size() - n;
-    point.value->head(rows) = lane->value.head(rows).template cast<double>();
-    point.jacobian->block(0, 0, rows, n) = Eigen::Map<const Matrix>(lane->jacobian.data(), rows, n).template cast<double>();
+    BringBack(lane->value.data(), rows, point.value->data());
+    if (!IsWhole(*point.jacobian, rows)) point.jacobian->block(0, 0, rows, n) = Eigen::Map<const Matrix>(lane->jacobian.data(), rows, n).template cast<double>();
     for (Eigen::Index k = 0; k < r; ++k) {
-      slots->Input(kDirection, typed.along.col(k).data());
+      double* const column = point.jacobian->col(n + k).data();
+      slots->Input(kDirection, typed.along.col(k).data()).Output(kValueOut, Out(column, &lane->value));
       autodiff::Evaluate(along_[function], *slots, arena);
-      point.jacobian->col(n + k).head(rows) = lane->value.head(rows).template cast<double>();
+      BringBack(lane->value.data(), rows, column);
     }
   }
 
   const nssm::Model model_;
   std::optional<nssm::GaussianPrior> prior_;
+  std::array<Executable<T>, kFunctions> prepare_;
+  std::array<int64_t, kFunctions> prepared_size_;
   std::array<Executable<T>, kFunctions> with_jacobian_, along_;
   Executable<T> encode_;
   int64_t argument_size_;

@@ -43,7 +43,7 @@ class FilterModel {
     const Parameters* parameters;
     Eigen::Map<const Eigen::VectorXd> x;  ///< n, or n + r with z behind it
     Eigen::Map<const Eigen::VectorXd> u;
-    Eigen::VectorXd* value;     ///< receives n rows, or of Measurement n_y
+    Eigen::VectorXd* value;     ///< receives n rows, or of Measurement n_y; overlaps neither x nor u
     Eigen::MatrixXd* jacobian;  ///< ∂/∂x, receives so many rows and as many columns as x has; both may be larger
   };
 

@@ -14,48 +14,83 @@ using Eigen::Ref;
 namespace {
 
 constexpr Index kRowsAtATime = 32;
+constexpr double kLeastSquare = 1e-280;  // of a row's tail: what is less than 1e-140 is nothing beside any covariance, and would not divide
+
+/// Rows r ← r − γ (r v) vᵀ, for `count` of them, at most kRowsAtATime, and v in columns i … cols − 1. The count is kRows where that is
+/// known when this is compiled: small filters are made of such loops.
+/// @param rows  the first of them in column 0. @param v  v_i first, `ld` elements from one to the next; v_i itself is `v0`.
+template <Index kRows>
+void Reflect(double* rows, Index count, Index ld, Index i, Index cols, double v0, const double* v, double gamma) {
+  if constexpr (kRows > 0) count = kRows;
+  double dots[kRows > 0 ? kRows : kRowsAtATime];
+  double* const column_i = rows + i * ld;
+  for (Index k = 0; k < count; ++k) dots[k] = 0;
+  // Down the columns, as they lie in memory.
+  for (Index j = 1; j < cols - i; ++j) {
+    const double factor = v[j * ld];
+    const double* const column = column_i + j * ld;
+    for (Index k = 0; k < count; ++k) dots[k] += column[k] * factor;
+  }
+  for (Index k = 0; k < count; ++k) {
+    dots[k] = (dots[k] + column_i[k] * v0) * gamma;
+    column_i[k] -= dots[k] * v0;
+  }
+  for (Index j = 1; j < cols - i; ++j) {
+    const double factor = v[j * ld];
+    double* const column = column_i + j * ld;
+    for (Index k = 0; k < count; ++k) column[k] -= dots[k] * factor;
+  }
+}
 
 }  // namespace
 
 void LowerTriangularise(Ref<MatrixXd> a) {
-  const Index rows = a.rows();
+  const Index rows = a.rows(), ld = a.outerStride();
+  double* const data = a.data();
   for (Index i = 0; i < rows; ++i) {
+    double* const row = data + i;
     // Columns that have nothing in row i stay as they are; behind a time update's Q^½, whose columns begin one after the other,
     // that is half of the work.
     Index cols = a.cols();
-    while (cols > i + 1 && a(i, cols - 1) == 0) --cols;
-    // A reflection of columns i … that maps row i's tail onto ± its norm e₁.
+    while (cols > i + 1 && row[(cols - 1) * ld] == 0) --cols;
+    // A reflection I − γ v vᵀ of columns i … that maps row i's tail onto its norm e₁: v = (head − norm, rest), γ = 2 / vᵀv = −1 / (norm v₀).
     double squared = 0;
-    for (Index j = i + 1; j < cols; ++j) squared += a(i, j) * a(i, j);
-    const double head = a(i, i);
-    if (squared > 0) {
+    for (Index j = i + 1; j < cols; ++j) squared += row[j * ld] * row[j * ld];
+    double& diagonal = row[i * ld];
+    const double head = diagonal;
+    if (squared >= kLeastSquare) {
       const double norm = std::sqrt(head * head + squared);
-      const double v0 = head <= 0 ? head - norm : -squared / (head + norm);  // no cancellation
-      const double beta = 2 * v0 * v0 / (squared + v0 * v0);
-      const double inverse = 1 / v0;
-      for (Index j = i + 1; j < cols; ++j) a(i, j) *= inverse;  // the reflection's vector is (1, this)
-      // Down the columns, as they lie in memory, for some rows at a time.
-      for (Index first = i + 1; first < rows; first += kRowsAtATime) {
-        const Index count = std::min(kRowsAtATime, rows - first);
-        double dots[kRowsAtATime];
-        for (Index k = 0; k < count; ++k) dots[k] = a(first + k, i);
-        for (Index j = i + 1; j < cols; ++j) {
-          const double factor = a(i, j);
-          const double* column = &a(first, j);
-          for (Index k = 0; k < count; ++k) dots[k] += column[k] * factor;
-        }
-        for (Index k = 0; k < count; ++k) a(first + k, i) -= dots[k] *= beta;
-        for (Index j = i + 1; j < cols; ++j) {
-          const double factor = a(i, j);
-          double* column = &a(first, j);
-          for (Index k = 0; k < count; ++k) column[k] -= dots[k] * factor;
-        }
+      const bool turns = head <= 0;  // else head − norm would cancel
+      const double v0 = turns ? head - norm : -squared / (head + norm);
+      const double gamma = turns ? -1 / (norm * v0) : (head + norm) / (norm * squared);
+      const Index below = rows - i - 1;
+      double* const first = row + 1;
+      const double* const v = &diagonal;
+      switch (below) {
+        case 0:
+          break;
+        case 1:
+          Reflect<1>(first, 1, ld, i, cols, v0, v, gamma);
+          break;
+        case 2:
+          Reflect<2>(first, 2, ld, i, cols, v0, v, gamma);
+          break;
+        case 3:
+          Reflect<3>(first, 3, ld, i, cols, v0, v, gamma);
+          break;
+        case 4:
+          Reflect<4>(first, 4, ld, i, cols, v0, v, gamma);
+          break;
+        default:
+          for (Index k = 0; k < below; k += kRowsAtATime) {
+            Reflect<0>(first + k, std::min(kRowsAtATime, below - k), ld, i, cols, v0, v, gamma);
+          }
       }
-      a(i, i) = norm;
-      for (Index j = i + 1; j < cols; ++j) a(i, j) = 0;
+      diagonal = norm;
     } else if (head < 0) {
-      for (Index k = i; k < rows; ++k) a(k, i) = -a(k, i);
+      for (Index k = i; k < rows; ++k) data[k + i * ld] = -data[k + i * ld];
     }
+    for (Index j = i + 1; j < cols; ++j) row[j * ld] = 0;
   }
 }
 

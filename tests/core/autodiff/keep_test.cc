@@ -72,6 +72,28 @@ TEST(KeepTest, WhatTheEarlierProgramDoesNotComputeIsNotKept) {
   EXPECT_EQ(SizeOfKept(net.graph, {}), 0);
 }
 
+TEST(KeepTest, WhatFollowsFromTheWeightsAloneIsComputedOnce) {
+  Graph graph;
+  const Value x = graph.Input(kSample, 0, kWidth, 1);
+  const Value first = graph.Input(kWeights, 0, kWidth, kWidth), second = graph.Input(kWeights, kWidth * kWidth, kWidth, kWidth);
+  const Value bias = graph.Input(kWeights, 2 * kWidth * kWidth, kWidth, 1);
+  std::vector<double> identity(kWidth * kWidth, 0);
+  for (size_t i = 0; i < kWidth; ++i) identity[i * (kWidth + 1)] = 1;
+  const Value z = graph.AddColumn(graph.MatMul(second, graph.MatMul(first, x)), bias);
+  const Value y = graph.Apply(Activation::kTanh, 0, 0, z);
+  const Value jacobian = Jvp(&graph, {{x, graph.ConstantData(identity, kWidth, kWidth)}}, {y}, kWidth)[0];
+  const std::vector<Output> outputs = {{y, kOut}, {jacobian, kOut, kWidth}};
+  const int64_t from_scratch = Multiplications(Compile(graph, outputs));
+  const std::vector<Output> kept = ValuesFromSlot(graph, outputs, kWeights, kRecord);
+  ASSERT_EQ(kept.size(), 1U);  // the second factor times the first, neither of the two nor the bias
+  EXPECT_EQ(graph.node(kept[0].value).cols, kWidth);
+  const int64_t once = Multiplications(Compile(graph, kept));
+  EXPECT_EQ(once, 2 * kWidth * kWidth * kWidth);
+  graph.TurnIntoInput(kept[0].value, kept[0].slot, kept[0].offset);
+  EXPECT_EQ(from_scratch - Multiplications(Compile(graph, outputs)), once);
+  EXPECT_TRUE(ValuesFromSlot(graph, {{y, kOut}}, kSample, kRecord).empty());
+}
+
 TEST(KeepTest, ProductsOfFewTermsAreComputedAgain) {
   Graph graph;
   const Value x = graph.MatMul(graph.Input(kWeights, 0, kWidth, 2), graph.Input(kSample, 0, 2, kSamples));

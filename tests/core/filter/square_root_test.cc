@@ -19,7 +19,7 @@ MatrixXd Random(base::Rng* rng, Eigen::Index rows, Eigen::Index cols) {
 
 TEST(SquareRootTest, TriangularisingKeepsTheProduct) {
   base::Rng rng(1);
-  for (const auto& [m, n] : {std::pair{1, 1}, {3, 3}, {3, 7}, {6, 12}}) {
+  for (const auto& [m, n] : {std::pair{1, 1}, {2, 4}, {3, 3}, {3, 7}, {6, 12}, {40, 80}}) {
     MatrixXd a = Random(&rng, m, n);
     if (m == 3) a.row(1).setZero();  // rank deficient
     const MatrixXd product = a * a.transpose();
@@ -28,6 +28,19 @@ TEST(SquareRootTest, TriangularisingKeepsTheProduct) {
     for (Eigen::Index i = 0; i < m; ++i) {
       EXPECT_GE(a(i, i), 0);
       for (Eigen::Index j = i + 1; j < n; ++j) EXPECT_EQ(a(i, j), 0);
+    }
+  }
+}
+
+TEST(SquareRootTest, TriangularisingBearsWhatIsFarApart) {
+  for (const double tail : {1e-300, 1e-150, 1e-20, 1e20, 1e150}) {
+    for (const double head : {-1.0, 0.0, 1.0}) {
+      MatrixXd a{{head, tail, -tail}, {1, 2, tail}};
+      const Eigen::Matrix2d product = a * a.transpose();
+      LowerTriangularise(a);
+      EXPECT_TRUE(a.allFinite()) << head << " beside " << tail;
+      const Eigen::Matrix2d now = a * a.transpose();
+      for (Eigen::Index i = 0; i < 2; ++i) EXPECT_NEAR(now(i, i), product(i, i), 1e-13 * product(i, i) + 1e-280) << head << " beside " << tail;
     }
   }
 }

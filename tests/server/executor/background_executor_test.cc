@@ -18,8 +18,8 @@ TEST(BackgroundExecutorTest, RunsWhatItTook) {
 }
 
 TEST(BackgroundExecutorTest, RefusesWhatDoesNotFit) {
+  std::promise<void> started, release;  // which what it runs uses until it is gone
   BackgroundExecutor executor({.threads = 1, .max_queued = 2});
-  std::promise<void> started, release;
   ASSERT_TRUE(executor.Submit([&] {
     started.set_value();
     release.get_future().wait();
