@@ -7,6 +7,7 @@
 #include "tests/server/support/server_process.h"
 #include "tests/server/support/server_test.h"
 #include "tests/server/support/tiny_models.h"
+#include "tests/support/sanitized.h"
 #include "tests/support/stream_signal.h"
 
 namespace metaekf::server {
@@ -111,7 +112,9 @@ TEST_F(RestartTest, AStopEndsAThousandStreamsSoThatNoneLosesASampleAndARestartSe
   });
   const double seconds = std::chrono::duration<double>(steady_clock::now() - start).count();
   std::printf("%d sessions: stopped in %.2f s, estimate again %.2f s after the start\n", kThreads * kPerThread, stopped, seconds);
-  EXPECT_LT(seconds, 2);
+  if (!METAEKF_SANITIZED) {
+    EXPECT_LT(seconds, 2);
+  }
 }
 
 }  // namespace

@@ -7,7 +7,6 @@
 #include <sys/types.h>
 
 #include <csignal>
-#include <filesystem>
 #include <functional>
 #include <thread>
 
@@ -17,6 +16,7 @@
 #include "tests/server/support/server_process.h"
 #include "tests/server/support/server_test.h"
 #include "tests/server/support/tiny_models.h"
+#include "tests/server/support/workers.h"
 #include "tests/support/faults.h"
 
 namespace metaekf::server {
@@ -109,17 +109,6 @@ class KillTest : public ::testing::Test {
   std::string config_;
 };
 
-/// The one worker of a server; 0 if there is none.
-pid_t FindWorker(pid_t server) {
-  std::error_code gone;
-  for (const auto& entry : std::filesystem::directory_iterator(absl::StrCat("/proc/", server, "/task"), gone)) {
-    std::ifstream children(entry.path() / "children");
-    pid_t child = 0;
-    if (children >> child) return child;
-  }
-  return 0;
-}
-
 /// Attempts at a job that were lost since the last checkpoint that the server heard of.
 int64_t LostInARow(const std::string& data_directory, int64_t job) {
   const auto database = store::Connection::Open(data_directory + "/metaekf.db", store::Connection::Mode::kReadOnly);
@@ -156,7 +145,7 @@ TEST_F(KillTest, EachJobPublishesOneVersionWithTheBitsOfAnUndisturbedOne) {
     }
     // Or less, if the job comes to its end before: there is nothing more to see then.
     (void)DirectoryChanges(directory_.path()).Wait(1 + rng.Index(kTrainingChanges), absl::Milliseconds(500));
-    const pid_t worker = FindWorker(server.pid());
+    const pid_t worker = WorkerOf(server.pid());
     if (kill % 2 == 1 && worker > 0) {
       // Then the server hears of one checkpoint at least before the next: a job that gets nowhere is given up, rightly.
       ::kill(worker, SIGKILL);

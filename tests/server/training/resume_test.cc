@@ -1,12 +1,13 @@
 // Workers and servers that die while they train: the job goes on, and its result is the same.
 
-#include <sys/types.h>
+#include <unistd.h>
 
 #include <filesystem>
 #include <thread>
 
 #include "tests/server/support/server_test.h"
 #include "tests/server/support/tiny_models.h"
+#include "tests/server/support/workers.h"
 
 namespace metaekf::server {
 namespace {
@@ -14,16 +15,6 @@ namespace {
 using ::testing::HasSubstr;
 
 constexpr uint32_t kIterations = 1500;
-
-/// The one worker of this process; 0 if there is none.
-pid_t FindWorker() {
-  for (const auto& entry : std::filesystem::directory_iterator("/proc/self/task")) {
-    std::ifstream children(entry.path() / "children");
-    pid_t child = 0;
-    if (children >> child) return child;
-  }
-  return 0;
-}
 
 class ResumeTest : public ServerTest {
  protected:
@@ -48,8 +39,8 @@ TEST_F(ResumeTest, AKilledWorkersJobGoesOnToTheSameBits) {
 
   ASSERT_TRUE(client_->CreateJob(TinyJob("killed", kIterations)).ok());
   AwaitCheckpoint(2);
-  ASSERT_GT(FindWorker(), 0);
-  ASSERT_EQ(kill(FindWorker(), SIGKILL), 0);
+  ASSERT_GT(WorkerOf(getpid()), 0);
+  ASSERT_EQ(kill(WorkerOf(getpid()), SIGKILL), 0);
   bool reported = false;
   const auto watched = client_->Watch("jobs/2", [&](const v1::WatchJobResponse& response) {
     reported = reported || response.error_message().find("killed by signal 9") != std::string::npos;
@@ -68,7 +59,7 @@ TEST_F(ResumeTest, AStoppedServersJobGoesOnToTheSameBits) {
   ASSERT_TRUE(client_->CreateJob(TinyJob("stopped", kIterations)).ok());
   AwaitCheckpoint(2);
   Stop();
-  EXPECT_EQ(FindWorker(), 0);
+  EXPECT_EQ(WorkerOf(getpid()), 0);
   Start();
   EXPECT_EQ(WatchToTheEnd("jobs/2").state(), v1::Job::SUCCEEDED);
   const v1::Job job = client_->Call(Named<v1::GetJobRequest>("jobs/2")).value;
