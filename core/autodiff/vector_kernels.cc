@@ -25,6 +25,8 @@ constexpr ptrdiff_t PanelHeight(int32_t rows) { return (ptrdiff_t{rows} + 15) / 
 #include <hwy/foreach_target.h>
 #include <hwy/highway.h>
 
+#include "core/linalg/store_rows-inl.h"
+
 HWY_BEFORE_NAMESPACE();
 namespace metaekf::autodiff {
 namespace HWY_NAMESPACE {
@@ -103,24 +105,6 @@ void ScaleBy(const Instruction& i, const Places<T>& at) {
 
 // ---- products with a panel ----
 
-/// c = v or addend + v in the first `rows` lanes, rows > 0.
-template <bool kAdd, class D, typename T = hn::TFromD<D>>
-HWY_INLINE void StoreRows(D d, hn::Vec<D> v, int rows, const T* addend, T* c) {
-  const int lanes = static_cast<int>(hn::Lanes(d));
-  if (rows >= lanes) {
-    hn::StoreU(kAdd ? hn::Add(hn::LoadU(d, addend), v) : v, d, c);
-    return;
-  }
-#if HWY_TARGET != HWY_SCALAR
-  if constexpr (hn::MaxLanes(D()) > 1) {
-    const hn::Half<D> half;
-    const int width = lanes / 2;
-    StoreRows<kAdd>(half, hn::LowerHalf(half, v), rows, addend, c);
-    if (rows > width) StoreRows<kAdd>(half, hn::UpperHalf(half, v), rows - width, addend + width, c + width);
-  }
-#endif
-}
-
 /// `rows` rows, which fill more than kVectors − 1 vectors but no more than kVectors, of one column of C. What an element is depends
 /// neither on kVectors nor on the width of vectors.
 template <int kVectors, bool kAdd, class D, typename T = hn::TFromD<D>>
@@ -154,7 +138,7 @@ HWY_INLINE void PanelRows(D d, int rows, int k, const T* HWY_RESTRICT panel, ptr
   METAEKF_UNROLL
   for (int i = 0; i < kVectors; ++i, rows -= lanes, addend += lanes, c += lanes) {
     const auto sum = hn::Add(hn::Add(sums[0][i], sums[1][i]), hn::Add(sums[2][i], sums[3][i]));
-    StoreRows<kAdd>(d, sum, rows, addend, c);
+    linalg::HWY_NAMESPACE::StoreRows<kAdd>(d, sum, rows, addend, c);
   }
 }
 

@@ -23,6 +23,7 @@
 #include <hwy/highway.h>
 
 #include "core/linalg/lane_sums-inl.h"
+#include "core/linalg/store_rows-inl.h"
 
 HWY_BEFORE_NAMESPACE();
 namespace metaekf::linalg {
@@ -105,13 +106,18 @@ HWY_INLINE void Tile(D d, int rows, int k, const T* HWY_RESTRICT a, ptrdiff_t ld
     }
     return;
   }
-  HWY_ALIGN T buffer[kVectors * hn::MaxLanes(D())];
   METAEKF_UNROLL
   for (int j = 0; j < kColumns; ++j) {
     METAEKF_UNROLL
-    for (int i = 0; i < kVectors; ++i) hn::Store(sums[j][i], d, buffer + i * lanes);
-    T* to = c.at + j * c.ld;
-    for (int i = 0; i < rows; ++i) to[i] = c.accumulate ? to[i] + buffer[i] : buffer[i];
+    for (int i = 0; i < kVectors; ++i) {
+      T* to = c.at + j * c.ld + i * lanes;
+      if (rows <= i * lanes) break;
+      if (c.accumulate) {
+        StoreRows<true>(d, sums[j][i], rows - i * lanes, to, to);
+      } else {
+        StoreRows<false>(d, sums[j][i], rows - i * lanes, to, to);
+      }
+    }
   }
 }
 

@@ -10,6 +10,7 @@ namespace metaekf::store {
 namespace {
 
 constexpr int kLockTimeoutMs = 5000;
+constexpr size_t kIdleReaders = 4;  // others are closed after use
 
 int Bind(sqlite3_stmt* statement, int index, const Value& value) {
   if (const auto* number = std::get_if<int64_t>(&value)) {
@@ -46,8 +47,8 @@ absl::StatusOr<std::unique_ptr<Connection>> Connection::Open(const std::string& 
   sqlite3_busy_timeout(handle, kLockTimeoutMs);
   METAEKF_RETURN_IF_ERROR(connection->Execute("PRAGMA foreign_keys = ON"));
   METAEKF_RETURN_IF_ERROR(connection->Execute("PRAGMA synchronous = FULL"));
-  // There are as many readers as there were ever at a time, and each connection would grow to 2 MB. What is missed the kernel has.
-  METAEKF_RETURN_IF_ERROR(connection->Execute("PRAGMA cache_size = -256"));
+  // KiB of pages that a connection keeps, where SQLite would let each grow to 2 MB. What is missed the kernel has.
+  METAEKF_RETURN_IF_ERROR(connection->Execute(mode == Mode::kReadOnly ? "PRAGMA cache_size = -64" : "PRAGMA cache_size = -256"));
   if (mode == Mode::kReadOnly) METAEKF_RETURN_IF_ERROR(connection->Execute("PRAGMA query_only = ON"));
   return connection;
 }
@@ -159,7 +160,7 @@ absl::Status Database::ReadTransaction(const Transaction& work) {
   }
   const absl::Status status = reader->Transact("BEGIN", work);
   std::lock_guard lock(readers_mutex_);
-  idle_readers_.push_back(std::move(reader));
+  if (idle_readers_.size() < kIdleReaders) idle_readers_.push_back(std::move(reader));
   return status;
 }
 
