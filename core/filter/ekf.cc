@@ -51,11 +51,11 @@ void CholeskyInPlace(Ref<MatrixXd> a) {
 /// A ← D R Rᵀ D with D = diag(scale), n × n; of a triangular R only the lower triangle is read.
 /// @param root  R, at least n rows, of which the first n are taken.
 void ScaledSquare(const MatrixXd& root, bool triangular, const VectorXd& scale, MatrixXd* a) {
-  const Index n = scale.size(), cols = triangular ? n : root.cols();
+  const Index n = scale.size();
   for (Index j = 0; j < n; ++j) {
     double* const below = &(*a)(0, j);
     for (Index i = j; i < n; ++i) below[i] = 0;
-    for (Index k = 0; k < (triangular ? j + 1 : cols); ++k) {
+    for (Index k = 0; k < (triangular ? j + 1 : root.cols()); ++k) {
       const double* const column = &root(0, k);
       const double factor = column[j];
       for (Index i = j; i < n; ++i) below[i] += factor * column[i];

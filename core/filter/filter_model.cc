@@ -185,7 +185,7 @@ class TypedFilterModel : public FilterModel {
     Matrix along;  // V
     std::optional<autodiff::PackedWeights<T>> packed;
     std::array<Factors, kFunctions> known;  // of weights that V leaves alone
-    std::array<Vector, kFunctions> prepared;
+    std::array<Vector, kFunctions> prepared;  // what follows from `values` alone
     std::vector<double> exact;  // for StartFit
   };
   /// What a point is evaluated with.

@@ -157,8 +157,9 @@ void EstimateStream::StartNext() {
     Finish(record_->End(*finish_with_));
     return;
   }
-  // Beyond its tenant's rate a request waits, and with it the client; the next sweep looks again.
-  const bool may_work = rate_ == nullptr || rate_->IsReady(steady_clock::now());
+  // Beyond its tenant's rate a request waits, and with it the client; so it does where its answer would be one too many to hold. The next
+  // sweep looks again.
+  const bool may_work = (rate_ == nullptr || rate_->IsReady(steady_clock::now())) && !(HasLongAnswer() && service_.HoldsTooMuch());
   if ((goes_on_ || has_request_) && !writing_ && !stop_applying_ && may_work) {
     if (!goes_on_) {
       has_request_ = false;
@@ -175,6 +176,10 @@ void EstimateStream::StartNext() {
     return StartNext();
   }
   Read();
+}
+
+bool EstimateStream::HasLongAnswer() const {
+  return live_ != nullptr && ValuesOf(goes_on_ ? work_ : request_) / output_size_ * row_bytes_ > kSmallBytes;
 }
 
 void EstimateStream::StartWork() {

@@ -62,6 +62,8 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   void Count(const v1::EstimateBatch& estimates);
   /// Whether batches of many sessions of this model are applied together where they wait.
   bool Queues() const;
+  /// Whether the answer to what comes next counts among what streams hold.
+  bool HasLongAnswer() const;
   /// Outputs that are estimated, which is what work takes time for.
   int64_t ValuesOf(const v1::EstimateRequest& work) const;
 
