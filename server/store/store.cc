@@ -5,6 +5,7 @@
 #include <sys/statvfs.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <cstdio>
 #include <filesystem>
@@ -238,10 +239,21 @@ absl::StatusOr<Inventory> Store::TakeInventory(const std::string& tenant, bool v
         METAEKF_RETURN_IF_ERROR(CountRows(connection, tenant, inventory));
         return ListFiles(connection, tenant);
       }));
+  OwnedFiles damaged;
+  std::vector<std::string> problems;
   for (const auto& [owner, digest] : files) {
     if (!verify_files && access(blobs_.Path(digest).c_str(), R_OK) == 0) continue;
     const absl::Status status = blobs_.Read(digest, owner).status();
-    if (!status.ok()) inventory.problems.emplace_back(status.message());
+    if (status.ok()) continue;
+    damaged.emplace_back(owner, digest);
+    problems.emplace_back(status.message());
+  }
+  if (!damaged.empty()) {
+    // What was removed while it was looked at is none.
+    METAEKF_ASSIGN_OR_RETURN(const OwnedFiles still, database_->Read([&](Connection& connection) { return ListFiles(connection, tenant); }));
+    for (size_t i = 0; i < damaged.size(); ++i) {
+      if (std::find(still.begin(), still.end(), damaged[i]) != still.end()) inventory.problems.push_back(std::move(problems[i]));
+    }
   }
   struct statvfs disk {};
   if (statvfs(directory_.c_str(), &disk) != 0)

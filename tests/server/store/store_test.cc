@@ -3,7 +3,9 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
+#include <atomic>
 #include <fstream>
+#include <thread>
 
 #include "server/store/schema.h"
 #include "tests/server/store/test_store.h"
@@ -177,6 +179,20 @@ TEST_F(StoreTest, TenantsDoNotSeeEachOthersThings) {
   EXPECT_EQ(Mine().models().ReadFile(*Mine().models().GetLatest("robot")).value(), "12345");
   EXPECT_EQ(store_->TakeInventory("other", false)->versions, 0);
   EXPECT_EQ(store_->TakeInventory(kDefaultTenant, false)->versions, 1);
+}
+
+TEST_F(StoreTest, WhatIsRemovedWhileAllIsLookedThroughIsNotMissed) {
+  AddVersion("staying");
+  std::atomic<bool> done = false;
+  std::thread changes([&] {
+    for (int i = 0; i < 200; ++i) {
+      const int64_t version = AddVersion("passing", std::to_string(i)).version;
+      EXPECT_TRUE(Mine().models().DeleteVersion("passing", version).ok());
+    }
+    done = true;
+  });
+  while (!done) EXPECT_THAT(store_->TakeInventory("", true)->problems, IsEmpty());
+  changes.join();
 }
 
 TEST_F(StoreTest, AFullDiskStopsNothingForGood) {
