@@ -157,10 +157,7 @@ void EstimateStream::StartNext() {
     Finish(record_->End(*finish_with_));
     return;
   }
-  // Beyond its tenant's rate a request waits, and with it the client; so it does where its answer would be one too many to hold. The next
-  // sweep looks again.
-  const bool may_work = (rate_ == nullptr || rate_->IsReady(steady_clock::now())) && !(HasLongAnswer() && service_.HoldsTooMuch());
-  if ((goes_on_ || has_request_) && !writing_ && !stop_applying_ && may_work) {
+  if ((goes_on_ || has_request_) && !writing_ && !stop_applying_ && MayWork()) {
     if (!goes_on_) {
       has_request_ = false;
       request_.Swap(&work_);
@@ -178,8 +175,10 @@ void EstimateStream::StartNext() {
   Read();
 }
 
-bool EstimateStream::HasLongAnswer() const {
-  return live_ != nullptr && ValuesOf(goes_on_ ? work_ : request_) / output_size_ * row_bytes_ > kSmallBytes;
+bool EstimateStream::MayWork() const {
+  if (rate_ != nullptr && !rate_->IsReady(steady_clock::now())) return false;
+  if (live_ == nullptr || !service_.HoldsTooMuch()) return true;
+  return ValuesOf(goes_on_ ? work_ : request_) / output_size_ * row_bytes_ <= kSmallBytes;
 }
 
 void EstimateStream::StartWork() {

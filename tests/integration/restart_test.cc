@@ -69,6 +69,7 @@ TEST_F(RestartTest, AStopEndsAThousandStreamsSoThatNoneLosesASampleAndARestartSe
       sessions[static_cast<size_t>(t)].push_back(std::move(*session));
     }
   });
+  ASSERT_FALSE(HasFatalFailure());
 
   const auto stop = steady_clock::now();
   std::thread reader([&] {
