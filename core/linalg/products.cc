@@ -65,7 +65,7 @@ struct Ahead {
   ptrdiff_t by;
 };
 
-/// The first `rows` rows of kVectors vectors by kColumns columns of C.
+/// kVectors vectors by kColumns columns of C; of a single vector the first `rows` rows.
 template <int kVectors, int kColumns, class D, typename T = hn::TFromD<D>>
 HWY_INLINE void Tile(D d, int rows, int k, const T* HWY_RESTRICT a, ptrdiff_t lda, Strided<T> b, Target<T> c, Ahead<T> ahead) {
   const int lanes = static_cast<int>(hn::Lanes(d));
@@ -95,28 +95,26 @@ HWY_INLINE void Tile(D d, int rows, int k, const T* HWY_RESTRICT a, ptrdiff_t ld
       for (int i = 0; i < kVectors; ++i) sums[j][i] = hn::MulAdd(column[i], factor, sums[j][i]);
     }
   }
-  if (rows == kVectors * lanes) {
-    METAEKF_UNROLL
-    for (int j = 0; j < kColumns; ++j) {
+  if constexpr (kVectors == 1) {
+    if (rows < lanes) {
       METAEKF_UNROLL
-      for (int i = 0; i < kVectors; ++i) {
-        T* to = c.at + j * c.ld + i * lanes;
-        hn::StoreU(c.accumulate ? hn::Add(hn::LoadU(d, to), sums[j][i]) : sums[j][i], d, to);
+      for (int j = 0; j < kColumns; ++j) {
+        T* to = c.at + j * c.ld;
+        if (c.accumulate) {
+          StoreRows<true>(d, sums[j][0], rows, to, to);
+        } else {
+          StoreRows<false>(d, sums[j][0], rows, to, to);
+        }
       }
+      return;
     }
-    return;
   }
   METAEKF_UNROLL
   for (int j = 0; j < kColumns; ++j) {
     METAEKF_UNROLL
     for (int i = 0; i < kVectors; ++i) {
       T* to = c.at + j * c.ld + i * lanes;
-      if (rows <= i * lanes) break;
-      if (c.accumulate) {
-        StoreRows<true>(d, sums[j][i], rows - i * lanes, to, to);
-      } else {
-        StoreRows<false>(d, sums[j][i], rows - i * lanes, to, to);
-      }
+      hn::StoreU(c.accumulate ? hn::Add(hn::LoadU(d, to), sums[j][i]) : sums[j][i], d, to);
     }
   }
 }

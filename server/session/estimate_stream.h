@@ -62,8 +62,8 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   void Count(const v1::EstimateBatch& estimates);
   /// Whether batches of many sessions of this model are applied together where they wait.
   bool Queues() const;
-  /// Whether what comes next may be worked on. Beyond its tenant's rate a request waits, and with it the client; so it does where its answer
-  /// would be one too many to hold. The next sweep looks again. Only while goes_on_ or has_request_: else request_ is gRPC's, being read.
+  /// Whether what comes next may be worked on. Beyond its tenant's rate a request waits, and with it the client; so it does where its
+  /// answer would be one too many to hold. The next sweep looks again. Only while goes_on_ or has_request_: else request_ is being read.
   bool MayWork() const;
   /// Outputs that are estimated, which is what work takes time for.
   int64_t ValuesOf(const v1::EstimateRequest& work) const;

@@ -1,19 +1,13 @@
 // Runs one hot path by name, for callgrind to count its instructions (check_instruction_counts).
 
 #include <cstdio>
-#include <fstream>
 #include <functional>
 #include <map>
-#include <sstream>
 #include <string>
 
-#include "core/base/executor.h"
-#include "core/data/split.h"
-#include "core/filter/ekf.h"
 #include "core/meta/adapt.h"
-#include "core/nssm/model_file.h"
-#include "core/sim/simulate.h"
 #include "server/session/session.h"
+#include "tests/benchmark/filter_steps.h"
 #include "tests/benchmark/networks.h"
 #include "tests/support/bundles.h"
 
@@ -23,35 +17,16 @@ extern "C" [[gnu::noipa]] void MeasuredHotPath(const std::function<void()>& work
 namespace metaekf {
 namespace {
 
-nssm::Bundle ZooModel(const std::string& name) {
-  std::ifstream file(METAEKF_SOURCE_DIR "/deploy/zoo/" + name + ".safetensors", std::ios::binary);
-  std::ostringstream bytes;
-  bytes << file.rdbuf();
-  return nssm::ReadModelFile(bytes.str()).value();
-}
+using benchmark::Oscillation;
+using benchmark::Simulated;
+using benchmark::ZooModel;
 
-data::Trajectory Simulated(const std::string& system, int64_t steps, const std::map<std::string, std::string>& settings) {
-  const auto executor = base::MakeThreadExecutor(1);
-  return sim::Simulate({.system = system, .systems = 1, .seed = 1, .steps = steps, .settings = settings}, *executor)
-      .value()
-      .dataset.trajectories[0];
-}
-
-/// @param outputs  a column per step.
 void Steps(const nssm::Bundle& bundle, const Eigen::MatrixXd& outputs) {
-  const std::shared_ptr<const filter::FilterModel> model = filter::FilterModel::Create(bundle);
-  filter::Ekf ekf = filter::Ekf::Create(bundle, model, model->Prepare(bundle), {}).value();
-  const auto scratch = model->MakeScratch();
-  filter::Estimate estimate = ekf.MakeEstimate();
-  const Eigen::VectorXd u = Eigen::VectorXd::Constant(ekf.input_size(), 0.3);
-  const auto step = [&](Eigen::Index t) { (void)ekf.Step(u, outputs.col(t), scratch.get(), &estimate); };
-  step(0);  // the first has no time update
+  benchmark::FilterSteps filter(bundle, outputs);
   MeasuredHotPath([&] {
-    for (Eigen::Index t = 1; t < outputs.cols(); ++t) step(t);
+    for (Eigen::Index t = 1; t < outputs.cols(); ++t) filter.Step();
   });
 }
-
-Eigen::MatrixXd Oscillation(int64_t steps) { return Simulated("van-der-pol", steps, {{"noise_std", "0.005"}}).outputs; }
 
 void SmallStep() { Steps(ZooModel("van-der-pol"), Oscillation(201)); }
 

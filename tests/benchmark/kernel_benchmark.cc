@@ -13,6 +13,7 @@
 #include "core/filter/square_root.h"
 #include "core/linalg/products.h"
 #include "tests/benchmark/ceilings.h"
+#include "tests/benchmark/filter_steps.h"
 #include "tests/benchmark/networks.h"
 
 namespace metaekf::benchmark {
@@ -112,6 +113,12 @@ void RolloutGradient(State& state) {
   state.counters["steps"] = Counter(static_cast<double>(state.range(0)), Counter::kIsIterationInvariantRate);
 }
 
+/// A sample of the van der Pol model that ships: two states, each operation waits for the last.
+void FilterStep(State& state) {
+  FilterSteps filter(ZooModel("van-der-pol"), Oscillation(200));
+  for ([[maybe_unused]] const auto _ : state) filter.Step();
+}
+
 // A layer of the localisation network and a context of 80 samples, halved between two threads; a sample with its three tangents.
 BENCHMARK_CAPTURE(FloatProduct, forward, true, false)->Args({256, 80, 256})->Args({256, 40, 256})->Args({256, 4, 256})->Args({256, 1, 256});
 BENCHMARK_CAPTURE(FloatProduct, backward, false, false)->Args({256, 80, 256})->Args({256, 40, 256})->Args({256, 4, 256});
@@ -123,6 +130,7 @@ BENCHMARK_CAPTURE(Activation, swish, autodiff::Activation::kSwish)->Arg(16)->Arg
 BENCHMARK(Square)->Args({144, 8192});
 BENCHMARK(Triangularise)->Arg(4)->Arg(24);
 BENCHMARK(RolloutGradient)->Arg(4096);
+BENCHMARK(FilterStep);
 
 }  // namespace
 }  // namespace metaekf::benchmark
