@@ -1,5 +1,6 @@
 include(CMakeFindDependencyMacro)
 find_dependency(Protobuf)
+find_dependency(absl CONFIG)
 find_dependency(gRPC CONFIG)
 find_dependency(OpenSSL)
 include(${CMAKE_CURRENT_LIST_DIR}/metaekfTargets.cmake)

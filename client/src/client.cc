@@ -1,5 +1,6 @@
 #include <cmath>
 
+#include "absl/synchronization/mutex.h"
 #include "client/src/impl.h"
 #include "client/src/text_proto.h"
 
@@ -37,11 +38,17 @@ std::shared_ptr<grpc::ChannelCredentials> Credentials(const std::optional<Tls>& 
   return grpc::SslCredentials({tls->authorities, tls->key, tls->certificate});
 }
 
+std::shared_ptr<grpc::Channel> MakeChannel(const Options& options) {
+  // Debian builds Abseil without NDEBUG: each lock in gRPC would be checked for cycles, and one that it believes in would end the process.
+  absl::SetMutexDeadlockDetectionMode(absl::OnDeadlockCycle::kIgnore);
+  return grpc::CreateCustomChannel(options.server, Credentials(options.tls), Arguments());
+}
+
 }  // namespace
 
 Client::Impl::Impl(const Options& client_options)
     : options(client_options),
-      channel(grpc::CreateCustomChannel(options.server, Credentials(options.tls), Arguments())),
+      channel(MakeChannel(options)),
       server(v1::ServerService::NewStub(channel)),
       models(v1::ModelService::NewStub(channel)),
       training(v1::TrainingService::NewStub(channel)),

@@ -4,6 +4,7 @@
 
 #include <cstdio>
 
+#include "absl/synchronization/mutex.h"
 #include "echo.grpc.pb.h"
 
 namespace metaekf::benchmark {
@@ -38,6 +39,7 @@ class Service final : public Echo::CallbackService {
 }  // namespace metaekf::benchmark
 
 int main() {
+  absl::SetMutexDeadlockDetectionMode(absl::OnDeadlockCycle::kIgnore);  // as metaekfd does
   metaekf::benchmark::Service service;
   int port = 0;
   grpc::ServerBuilder builder;
