@@ -3,8 +3,8 @@
 //
 //   neighbour ADDRESS RECONNECT_FOR_S     RECONNECT_FOR_S 0: its connection is not to be lost, and the server is to be healthy
 //
-// Prints a line after every kNeighbourRound answers: how long each took, in ms. Ends with SIGTERM; with status 1 and the reason if it
-// was not served.
+// Prints a line after every kNeighbourRound answers, and at the end: how long each took, in ms. Ends with SIGTERM; with status 1 and
+// the reason if it was not served.
 
 #include <signal.h>
 
@@ -32,6 +32,13 @@ int Fail(const std::string& why) {
   return 1;
 }
 
+void Tell(std::vector<double>& round_ms) {
+  for (const double ms : round_ms) std::printf("%.3f ", ms);
+  std::printf("\n");
+  std::fflush(stdout);
+  round_ms.clear();
+}
+
 int Run(const std::string& address, double reconnect_for_s) {
   client::Client client({.server = address});
   client::EstimationOptions options;
@@ -49,14 +56,10 @@ int Run(const std::string& address, double reconnect_for_s) {
     const auto batch = (*session)->Receive();
     if (!batch.ok()) return Fail(batch.status().message);
     round_ms.push_back(std::chrono::duration<double, std::milli>(steady_clock::now() - start).count());
-    if (round_ms.size() == kNeighbourRound) {
-      for (const double ms : round_ms) std::printf("%.3f ", ms);
-      std::printf("\n");
-      std::fflush(stdout);
-      round_ms.clear();
-    }
+    if (round_ms.size() == kNeighbourRound) Tell(round_ms);
     std::this_thread::sleep_for(std::chrono::milliseconds(1));
   }
+  Tell(round_ms);
   return 0;
 }
 
