@@ -39,7 +39,7 @@ std::shared_ptr<grpc::ChannelCredentials> Credentials(const std::optional<Tls>& 
 }
 
 std::shared_ptr<grpc::Channel> MakeChannel(const Options& options) {
-  // Debian builds Abseil without NDEBUG: each lock in gRPC would be checked for cycles, and one that it believes in would end the process.
+  // See README.md.
   absl::SetMutexDeadlockDetectionMode(absl::OnDeadlockCycle::kIgnore);
   return grpc::CreateCustomChannel(options.server, Credentials(options.tls), Arguments());
 }

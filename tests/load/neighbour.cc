@@ -57,7 +57,7 @@ int Run(const std::string& address, double reconnect_for_s) {
     if (!batch.ok()) return Fail(batch.status().message);
     round_ms.push_back(std::chrono::duration<double, std::milli>(steady_clock::now() - start).count());
     if (round_ms.size() == kNeighbourRound) Tell(round_ms);
-    std::this_thread::sleep_for(std::chrono::milliseconds(1));
+    std::this_thread::sleep_for(std::chrono::milliseconds(1));  // a sensor's pace
   }
   Tell(round_ms);
   return 0;

@@ -6,6 +6,7 @@
 #include <CLI/CLI.hpp>
 #include <atomic>
 #include <chrono>
+#include <condition_variable>
 #include <csignal>
 #include <cstdio>
 #include <filesystem>
@@ -87,9 +88,16 @@ class Soak {
   void StartServer();
   client::Client Connect() const { return client::Client({.server = address_, .timeout_s = 60}); }
   /// Waits, but not longer than the soak lasts.
-  void Pause(milliseconds time) const {
-    const auto until = std::min(steady_clock::now() + time, end_);
-    while (!stop_ && steady_clock::now() < until) std::this_thread::sleep_for(std::min(time, milliseconds(50)));
+  void Pause(milliseconds time) {
+    std::unique_lock lock(pause_mutex_);
+    stopped_.wait_until(lock, std::min(steady_clock::now() + time, end_), [this] { return stop_.load(); });
+  }
+  void Stop() {
+    {
+      std::lock_guard lock(pause_mutex_);
+      stop_ = true;
+    }
+    stopped_.notify_all();
   }
   bool running() const { return !stop_ && steady_clock::now() < end_; }
 
@@ -111,6 +119,8 @@ class Soak {
   std::unique_ptr<ServerProcess> server_;
   steady_clock::time_point end_;
   std::atomic<bool> stop_ = false;
+  std::mutex pause_mutex_;
+  std::condition_variable stopped_;
   std::vector<Ended> ended_;
 };
 
@@ -164,7 +174,7 @@ void Soak::Stream(int stream) {
       next += (*batch)->samples;
     }
     report_.Count("samples", static_cast<int64_t>(count));
-    std::this_thread::sleep_for(milliseconds(20 + rng.Index(60)));
+    Pause(milliseconds(20 + rng.Index(60)));  // a sensor's pace
   }
   ended_[static_cast<size_t>(stream)] = {next - 1, digest.value()};
 }
@@ -421,7 +431,7 @@ int Soak::Run() {
     files.push_back(use.open_files);
     Pause(seconds(1));
   }
-  stop_ = report_.violations() >= 10;
+  if (report_.violations() >= 10) Stop();
   for (std::thread& thread : threads) thread.join();
   const auto fifth = [](const std::vector<double>& all, int which) {
     const auto size = static_cast<ptrdiff_t>(all.size() / 5), begin = which * size;
