@@ -41,11 +41,22 @@ class Memory {
   std::array<T*, kBefore + Slots<T>::kMaxSlots> bases_;
 };
 
+/// Calls visit(place in the result, place in the tiled operand, elements) for every tile.
+template <typename Visit>
+void ForEachTile(const Instruction& i, const Operand& tiled, Visit visit) {
+  const int64_t size = int64_t{i.rows} * tiled.tile_width;
+  const int64_t blocks = i.cols / (int64_t{tiled.tile_width} * tiled.tile_count);
+  int64_t at = 0;
+  for (int64_t block = 0; block < blocks; ++block) {
+    for (int32_t repeat = 0; repeat < tiled.tile_count; ++repeat, at += size) visit(at, block * size, size);
+  }
+}
+
 /// The kernel of an instruction, for its shape and for the processor at hand.
 template <typename T>
 Kernel<T> SelectKernel(const Instruction& i);
 
-/// Of an elementwise operation without tiles, of a product with a panel or of few elements: in vectors. Null for others.
+/// Of an elementwise operation, of a product with a panel or of few elements: in vectors. Null for others.
 template <typename T>
 Kernel<T> SelectVectorKernel(const Instruction& i);
 /// Of an activation.

@@ -3,41 +3,12 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
-#include <functional>
 
 #include "core/autodiff/kernel.h"
 #include "core/linalg/products.h"
 
 namespace metaekf::autodiff {
 namespace {
-
-/// Calls visit(place in the result, place in the tiled operand, elements) for every tile.
-template <typename Visit>
-void ForEachTile(const Instruction& i, const Operand& tiled, Visit visit) {
-  const int64_t size = int64_t{i.rows} * tiled.tile_width;
-  const int64_t blocks = i.cols / (int64_t{tiled.tile_width} * tiled.tile_count);
-  int64_t at = 0;
-  for (int64_t block = 0; block < blocks; ++block) {
-    for (int32_t repeat = 0; repeat < tiled.tile_count; ++repeat, at += size) visit(at, block * size, size);
-  }
-}
-
-/// out = function(a, b) elementwise, where one of the two is tiled.
-template <class Function, typename T>
-void Tiled(const Instruction& i, const Places<T>& at) {
-  T* out = at.out;
-  const T* a = at.a;
-  const T* b = at.b;
-  if (i.b.tile_width != 0) {
-    ForEachTile(i, i.b, [&](int64_t to, int64_t from, int64_t size) {
-      for (int64_t k = 0; k < size; ++k) out[to + k] = Function()(a[to + k], b[from + k]);
-    });
-  } else {
-    ForEachTile(i, i.a, [&](int64_t to, int64_t from, int64_t size) {
-      for (int64_t k = 0; k < size; ++k) out[to + k] = Function()(a[from + k], b[to + k]);
-    });
-  }
-}
 
 /// @param from  where `operand` lies.
 template <typename T>
@@ -171,12 +142,6 @@ Kernel<T> SelectKernel(const Instruction& i) {
       return Product<false, T>;
     case Opcode::kMatMulAdd:
       return Product<true, T>;
-    case Opcode::kAdd:
-      return Tiled<std::plus<T>, T>;
-    case Opcode::kSub:
-      return Tiled<std::minus<T>, T>;
-    case Opcode::kMul:
-      return Tiled<std::multiplies<T>, T>;
     case Opcode::kDot:
       return Dot<T>;
     case Opcode::kActivation:
@@ -189,7 +154,10 @@ Kernel<T> SelectKernel(const Instruction& i) {
       return CopyRows<T>;
     case Opcode::kSliceRows:
       return SliceRows<T>;
-    case Opcode::kScale:  // these have vector kernels
+    case Opcode::kAdd:  // these have vector kernels
+    case Opcode::kSub:
+    case Opcode::kMul:
+    case Opcode::kScale:
     case Opcode::kScaleBy:
     case Opcode::kLoop:  // runs its instructions' kernels
       break;

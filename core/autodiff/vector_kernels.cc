@@ -69,17 +69,28 @@ HWY_INLINE void EndOfPairs(D d, int64_t count, const T* a, const T* b, T* out) {
 }
 
 template <class Operation, typename T>
-void Pairs(const Instruction& i, const Places<T>& at) {
+HWY_INLINE void PairsOf(int64_t count, const T* a, const T* b, T* out) {
   const hn::ScalableTag<T> d;
   const int64_t lanes = static_cast<int64_t>(hn::Lanes(d));
-  const T* a = at.a;
-  const T* b = at.b;
-  T* out = at.out;
-  int64_t count = int64_t{i.rows} * i.cols;
   for (; count >= lanes; count -= lanes, a += lanes, b += lanes, out += lanes) {
     hn::StoreU(Operation::Apply(hn::LoadU(d, a), hn::LoadU(d, b)), d, out);
   }
   EndOfPairs<Operation>(d, count, a, b, out);
+}
+
+template <class Operation, typename T>
+void Pairs(const Instruction& i, const Places<T>& at) {
+  PairsOf<Operation>(int64_t{i.rows} * i.cols, at.a, at.b, at.out);
+}
+
+/// Where one of the two is tiled.
+template <class Operation, typename T>
+void TiledPairs(const Instruction& i, const Places<T>& at) {
+  if (i.b.tile_width != 0) {
+    ForEachTile(i, i.b, [&](int64_t to, int64_t from, int64_t size) { PairsOf<Operation>(size, at.a + to, at.b + from, at.out + to); });
+  } else {
+    ForEachTile(i, i.a, [&](int64_t to, int64_t from, int64_t size) { PairsOf<Operation>(size, at.a + from, at.b + to, at.out + to); });
+  }
 }
 
 /// out = factor · a
@@ -198,21 +209,90 @@ HWY_INLINE T ScalarProduct(int depth, const T* HWY_RESTRICT a, const T* HWY_REST
   return sum;
 }
 
-/// C ← AᵀB or D + AᵀB of few elements, as an extended Kalman filter of a small model has by the dozen.
-template <int kDepth, bool kAdd, typename T>
+/// C ← AᵀB or D + AᵀB of few elements, as an extended Kalman filter of a small model has by the dozen; of kRows rows and depth kDepth,
+/// where these are not 0.
+template <int kRows, int kDepth, bool kAdd, typename T>
 void SmallProduct(const Instruction& i, const Places<T>& at) {
-  const int rows = i.rows, depth = i.inner;
+  const int depth = i.inner;
   const ptrdiff_t lda = i.a.ld;
   const T* b = at.b;
   const T* addend = at.c;
   T* c = at.out;
   for (int32_t j = 0; j < i.cols; ++j, b += i.b.ld, addend += i.c.ld, c += i.out.ld) {
     const T* a = at.a;
-    for (int r = 0; r < rows; ++r, a += lda) {
+    const auto row = [&](int r) {
       const T sum = ScalarProduct<kDepth>(depth, a, b);
+      c[r] = kAdd ? addend[r] + sum : sum;
+      a += lda;
+    };
+    if constexpr (kRows > 0) {
+      METAEKF_UNROLL
+      for (int r = 0; r < kRows; ++r) row(r);
+    } else {
+      for (int r = 0; r < i.rows; ++r) row(r);
+    }
+  }
+}
+
+/// v ← so many vectors of elements that lie in turns.
+template <class D, class V = hn::Vec<D>>
+HWY_INLINE void LoadTurns(D d, const hn::TFromD<D>* from, V (&v)[2]) {
+  hn::LoadInterleaved2(d, from, v[0], v[1]);
+}
+template <class D, class V = hn::Vec<D>>
+HWY_INLINE void LoadTurns(D d, const hn::TFromD<D>* from, V (&v)[3]) {
+  hn::LoadInterleaved3(d, from, v[0], v[1], v[2]);
+}
+template <class D, class V = hn::Vec<D>>
+HWY_INLINE void LoadTurns(D d, const hn::TFromD<D>* from, V (&v)[4]) {
+  hn::LoadInterleaved4(d, from, v[0], v[1], v[2], v[3]);
+}
+
+/// SmallProduct to the bit, of many rows that lie one behind the other: a network's first layer.
+template <int kDepth, bool kAdd, typename T>
+void TallProduct(const Instruction& i, const Places<T>& at) {
+  const hn::ScalableTag<T> d;
+  const int lanes = static_cast<int>(hn::Lanes(d)), rows = i.rows;
+  const T* b = at.b;
+  const T* addend = at.c;
+  T* c = at.out;
+  for (int32_t j = 0; j < i.cols; ++j, b += i.b.ld, addend += i.c.ld, c += i.out.ld) {
+    const T* a = at.a;
+    int r = 0;
+    for (; r + lanes <= rows; r += lanes, a += kDepth * lanes) {
+      hn::Vec<decltype(d)> columns[kDepth];
+      LoadTurns(d, a, columns);
+      auto sum = hn::Mul(columns[0], hn::Set(d, b[0]));
+      METAEKF_UNROLL
+      for (int l = 1; l < kDepth; ++l) sum = hn::MulAdd(columns[l], hn::Set(d, b[l]), sum);
+      if constexpr (kAdd) sum = hn::Add(hn::LoadU(d, addend + r), sum);
+      hn::StoreU(sum, d, c + r);
+    }
+    for (; r < rows; ++r, a += kDepth) {
+      const T sum = ScalarProduct<kDepth>(kDepth, a, b);
       c[r] = kAdd ? addend[r] + sum : sum;
     }
   }
+}
+
+template <int kDepth, bool kAdd, typename T>
+Kernel<T> SelectSmallProduct(const Instruction& i) {
+  switch (i.rows) {
+    case 1:
+      return SmallProduct<1, kDepth, kAdd, T>;
+    case 2:
+      return SmallProduct<2, kDepth, kAdd, T>;
+    case 3:
+      return SmallProduct<3, kDepth, kAdd, T>;
+    case 4:
+      return SmallProduct<4, kDepth, kAdd, T>;
+    default:
+      break;
+  }
+  if constexpr (kDepth > 1) {
+    if (i.a.ld == kDepth && i.rows >= static_cast<int>(hn::Lanes(hn::ScalableTag<T>()))) return TallProduct<kDepth, kAdd, T>;
+  }
+  return SmallProduct<0, kDepth, kAdd, T>;
 }
 
 template <bool kAdd, typename T>
@@ -222,15 +302,15 @@ Kernel<T> SelectProduct(const Instruction& i) {
   if (!i.transpose_a || i.transpose_b || (kAdd && i.c.tile_width != 0) || int64_t{i.rows} * i.cols * i.inner > kFew) return nullptr;
   switch (i.inner) {
     case 1:
-      return SmallProduct<1, kAdd, T>;
+      return SelectSmallProduct<1, kAdd, T>(i);
     case 2:
-      return SmallProduct<2, kAdd, T>;
+      return SelectSmallProduct<2, kAdd, T>(i);
     case 3:
-      return SmallProduct<3, kAdd, T>;
+      return SelectSmallProduct<3, kAdd, T>(i);
     case 4:
-      return SmallProduct<4, kAdd, T>;
+      return SelectSmallProduct<4, kAdd, T>(i);
     default:
-      return SmallProduct<0, kAdd, T>;
+      return SmallProduct<0, 0, kAdd, T>;
   }
 }
 
@@ -243,11 +323,11 @@ Kernel<T> Select(const Instruction& i) {
     case Opcode::kMatMulAdd:
       return SelectProduct<true, T>(i);
     case Opcode::kAdd:
-      return tiled ? nullptr : Pairs<Sum, T>;
+      return tiled ? TiledPairs<Sum, T> : Pairs<Sum, T>;
     case Opcode::kSub:
-      return tiled ? nullptr : Pairs<Difference, T>;
+      return tiled ? TiledPairs<Difference, T> : Pairs<Difference, T>;
     case Opcode::kMul:
-      return tiled ? nullptr : Pairs<ElementProduct, T>;
+      return tiled ? TiledPairs<ElementProduct, T> : Pairs<ElementProduct, T>;
     case Opcode::kScale:
       return Scale<T>;
     case Opcode::kScaleBy:

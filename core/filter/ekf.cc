@@ -2,10 +2,12 @@
 
 #include <cmath>
 #include <limits>
+#include <utility>
 
 #include "absl/container/inlined_vector.h"
 #include "core/base/numbers.h"
 #include "core/base/status.h"
+#include "core/base/with_count.h"
 #include "core/filter/chi_squared.h"
 #include "core/filter/constrain.h"
 #include "core/filter/least_squares_start.h"
@@ -51,17 +53,18 @@ void CholeskyInPlace(Ref<MatrixXd> a) {
 /// A ← D R Rᵀ D with D = diag(scale), n × n; of a triangular R only the lower triangle is read.
 /// @param root  R, at least n rows, of which the first n are taken.
 void ScaledSquare(const MatrixXd& root, bool triangular, const VectorXd& scale, MatrixXd* a) {
-  const Index n = scale.size();
-  for (Index j = 0; j < n; ++j) {
-    double* const below = &(*a)(0, j);
-    for (Index i = j; i < n; ++i) below[i] = 0;
-    for (Index k = 0; k < (triangular ? j + 1 : root.cols()); ++k) {
-      const double* const column = &root(0, k);
-      const double factor = column[j];
-      for (Index i = j; i < n; ++i) below[i] += factor * column[i];
+  base::WithCount(scale.size(), [&](auto n) {
+    for (Index j = 0; j < n; ++j) {
+      double* const below = &(*a)(0, j);
+      for (Index i = j; i < n; ++i) below[i] = 0;
+      for (Index k = 0; k < (triangular ? j + 1 : root.cols()); ++k) {
+        const double* const column = &root(0, k);
+        const double factor = column[j];
+        for (Index i = j; i < n; ++i) below[i] += factor * column[i];
+      }
+      for (Index i = j; i < n; ++i) (*a)(j, i) = below[i] *= scale[i] * scale[j];
     }
-    for (Index i = j; i < n; ++i) (*a)(j, i) = below[i] *= scale[i] * scale[j];
-  }
+  });
 }
 
 absl::Status CheckSize(const std::string& name, const MatrixXd& matrix, Index n) {
@@ -136,6 +139,8 @@ absl::StatusOr<Ekf> Ekf::Create(const nssm::Bundle& bundle, std::shared_ptr<cons
   ekf.process_factor_ = with_extra(process_factor, ekf.joint_.ExtraNoise());
   ekf.initial_factor_ = with_extra(initial_factor, ekf.joint_.ExtraDeviations(noise.parameter_std));
   METAEKF_ASSIGN_OR_RETURN(ekf.measurement_cov_, NormalisedNoise(R, bundle.normaliser.outputs.scale));
+  ekf.measurement_factor_ = ekf.measurement_cov_;
+  CholeskyInPlace(ekf.measurement_factor_);
 
   ekf.initial_mean_ = VectorXd::Zero(joint);
   if (options.initial_mean) {
@@ -273,12 +278,14 @@ void Ekf::MeasurementUpdate(FilterModel::Scratch* scratch, Estimate* estimate) {
   state_.started = true;
   ++state_.samples;
   state_.last_input = u_;
-  estimate->innovation.setConstant(kNaN);
-  estimate->innovation_cov.setConstant(kNaN);
+  if (std::cmp_less(measured_.size(), output_size_)) {
+    estimate->innovation.setConstant(kNaN);
+    estimate->innovation_cov.setConstant(kNaN);
+  }
   estimate->nis = kNaN;
   estimate->gated = 0;
   estimate->measured = static_cast<int>(measured_.size());
-  if (!measured_.empty()) Update(sample_cov_ ? *sample_cov_ : measurement_cov_, estimate);
+  if (!measured_.empty()) Update(estimate);
   PutInside(scratch, estimate);
 }
 
@@ -352,9 +359,9 @@ void Ekf::BeginFromWindow(FilterModel::Scratch* scratch) {
 }
 
 /// x⁻ to x⁺ by what was measured, from h and H there.
-void Ekf::Update(const MatrixXd& R, Estimate* estimate) {
+void Ekf::Update(Estimate* estimate) {
   prior_factor_ = state_.factor;
-  estimate->nis = UpdateFactor(measured_, R);
+  estimate->nis = UpdateFactor(measured_);
   WriteInnovation(estimate);
   const size_t m = measured_.size();
   const bool outliers = !gate_limits_.empty() && !(estimate->nis <= gate_limits_[m - 1] * std::max(1.0, state_.nis.Ratio()));
@@ -364,53 +371,63 @@ void Ekf::Update(const MatrixXd& R, Estimate* estimate) {
     return MoveMean();
   }
   state_.factor = prior_factor_;
-  LeaveOutliersOut(R, estimate);
+  LeaveOutliersOut(estimate);
 }
 
-double Ekf::UpdateFactor(const std::vector<Index>& rows, const MatrixXd& R) {
-  const Index m = static_cast<Index>(rows.size()), n = state_size_;
-  auto work = update_work_.topLeftCorner(m + n, m + n);
-  for (Index i = 0; i < m; ++i) {
-    const Index row = rows[static_cast<size_t>(i)];
-    H_rows_.row(i) = H_.row(row);
-    whitened_[i] = y_[row] - h_[row];
-    for (Index j = 0; j < m; ++j) work(i, j) = R(row, rows[static_cast<size_t>(j)]);
-  }
-  CholeskyInPlace(work.topLeftCorner(m, m));
-  FactorMeasurementUpdate(H_rows_.topRows(m), work, &state_.factor);
-  updated_ = m;
-  double nis = 0;
-  for (Index i = 0; i < m; ++i) {
-    for (Index j = 0; j < i; ++j) whitened_[i] -= work(i, j) * whitened_[j];
-    whitened_[i] /= work(i, i);
-    nis += whitened_[i] * whitened_[i];
-  }
-  return nis;
+double Ekf::UpdateFactor(const std::vector<Index>& rows) {
+  const Index n = state_size_;
+  updated_ = static_cast<Index>(rows.size());
+  const auto work = update_work_.topLeftCorner(updated_ + n, updated_ + n);
+  const bool usual = updated_ == output_size_ && !sample_cov_;
+  return base::WithCount(updated_, [&](auto m) {
+    const MatrixXd& R_or_factor = usual ? measurement_factor_ : R();
+    for (Index i = 0; i < m; ++i) {
+      const Index row = rows[static_cast<size_t>(i)];
+      whitened_[i] = y_[row] - h_[row];
+      for (Index j = 0; j < n; ++j) H_rows_(i, j) = H_(row, j);
+      for (Index j = 0; j < m; ++j) update_work_(i, j) = R_or_factor(row, rows[static_cast<size_t>(j)]);
+    }
+    if (!usual) CholeskyInPlace(update_work_.topLeftCorner(m, m));
+    FactorMeasurementUpdate(H_rows_.topRows(m), work, &state_.factor);
+    double nis = 0;
+    for (Index i = 0; i < m; ++i) {
+      for (Index j = 0; j < i; ++j) whitened_[i] -= update_work_(i, j) * whitened_[j];
+      whitened_[i] /= update_work_(i, i);
+      nis += whitened_[i] * whitened_[i];
+    }
+    return nis;
+  });
 }
 
 void Ekf::MoveMean() {
-  const auto work = update_work_.topLeftCorner(updated_ + state_size_, updated_);
-  for (Index j = 0; j < updated_; ++j) state_.mean += work.col(j).tail(state_size_) * whitened_[j];
+  base::WithCount(state_size_, [&](auto n) {
+    for (Index j = 0; j < updated_; ++j) {
+      const double* const gain = &update_work_(updated_, j);  // K S^½
+      for (Index i = 0; i < n; ++i) state_.mean[i] += gain[i] * whitened_[j];
+    }
+  });
 }
 
 void Ekf::WriteInnovation(Estimate* estimate) const {
   const VectorXd& scale = normaliser_.outputs.scale;
-  for (Index i = 0; i < updated_; ++i) {
-    const Index row = measured_[static_cast<size_t>(i)];
-    estimate->innovation[row] = (y_[row] - h_[row]) * scale[row];
-    for (Index j = 0; j < updated_; ++j) {
-      const Index col = measured_[static_cast<size_t>(j)];
-      double sum = 0;
-      for (Index k = 0; k <= std::min(i, j); ++k) sum += update_work_(i, k) * update_work_(j, k);
-      estimate->innovation_cov(row, col) = sum * scale[row] * scale[col];
+  base::WithCount(updated_, [&](auto m) {
+    for (Index i = 0; i < m; ++i) {
+      const Index row = measured_[static_cast<size_t>(i)];
+      estimate->innovation[row] = (y_[row] - h_[row]) * scale[row];
+      for (Index j = 0; j <= i; ++j) {
+        const Index col = measured_[static_cast<size_t>(j)];
+        double sum = 0;
+        for (Index k = 0; k <= j; ++k) sum += update_work_(i, k) * update_work_(j, k);
+        estimate->innovation_cov(row, col) = estimate->innovation_cov(col, row) = sum * scale[row] * scale[col];
+      }
     }
-  }
+  });
 }
 
-void Ekf::LeaveOutliersOut(const MatrixXd& R, Estimate* estimate) {
+void Ekf::LeaveOutliersOut(Estimate* estimate) {
   const VectorXd innovation = (y_ - h_)(measured_);
   const MatrixXd predicted = H_(measured_, Eigen::all) * prior_factor_;
-  const MatrixXd predicted_cov = predicted * predicted.transpose(), R_measured = R(measured_, measured_);
+  const MatrixXd predicted_cov = predicted * predicted.transpose(), R_measured = R()(measured_, measured_);
   if (state_.gated_in_row >= recover_after_) {
     state_.gated_in_row = 0;
     estimate->reset = true;
@@ -418,7 +435,7 @@ void Ekf::LeaveOutliersOut(const MatrixXd& R, Estimate* estimate) {
     const double widening = WideningFor(innovation, predicted_cov, R_measured);
     if (trace_ != nullptr) trace_->widening = widening;
     state_.factor *= std::sqrt(widening);
-    UpdateFactor(measured_, R);
+    UpdateFactor(measured_);
     return MoveMean();
   }
   ++state_.gated_in_row;
@@ -431,7 +448,7 @@ void Ekf::LeaveOutliersOut(const MatrixXd& R, Estimate* estimate) {
     if (!std::binary_search(outliers.begin(), outliers.end(), static_cast<Index>(i))) kept.push_back(measured_[i]);
   }
   if (kept.empty()) return;
-  state_.nis.Add(UpdateFactor(kept, R), static_cast<int>(kept.size()));
+  state_.nis.Add(UpdateFactor(kept), static_cast<int>(kept.size()));
   MoveMean();
 }
 

@@ -179,13 +179,14 @@ class Ekf {
 
   void FillWindow(FilterModel::Scratch* scratch);  // adds (u_, y_), begins when full
   void BeginFromWindow(FilterModel::Scratch* scratch);
-  void Update(const Eigen::MatrixXd& R, Estimate* estimate);
+  void Update(Estimate* estimate);
   void WriteEstimate(const Eigen::VectorXd& mean, const Eigen::MatrixXd& factor, Estimate* estimate);
   // L⁻ to L⁺ by some components of y; leaves S^½ and K S^½ in update_work_ and S^−½ ỹ in whitened_. Returns their NIS.
-  double UpdateFactor(const std::vector<Eigen::Index>& rows, const Eigen::MatrixXd& R);
+  double UpdateFactor(const std::vector<Eigen::Index>& rows);
   void MoveMean();
   void WriteInnovation(Estimate* estimate) const;
-  void LeaveOutliersOut(const Eigen::MatrixXd& R, Estimate* estimate);
+  void LeaveOutliersOut(Estimate* estimate);
+  const Eigen::MatrixXd& R() const { return sample_cov_ ? *sample_cov_ : measurement_cov_; }
   void Restart();
   void PutInside(FilterModel::Scratch* scratch, Estimate* estimate);
   void JudgeHealth(Estimate* estimate);
@@ -201,7 +202,7 @@ class Ekf {
   std::optional<physics::Polyhedron> set_;             // of what is estimated, in physical units
   std::optional<physics::Polyhedron> normalised_set_;  // of the state
   Eigen::MatrixXd process_factor_;    // Q^½, normalised
-  Eigen::MatrixXd measurement_cov_;   // R, normalised
+  Eigen::MatrixXd measurement_cov_, measurement_factor_;  // R and R^½, normalised
   Eigen::VectorXd initial_mean_;      // normalised
   Eigen::MatrixXd initial_factor_;
   std::vector<double> gate_limits_;   // on the NIS of 1 … n_y components; empty: no gate

@@ -62,6 +62,7 @@ void JointModel::Transition(const Ref<const VectorXd>& s, const Ref<const Vector
 }
 
 void JointModel::CompleteTransition(const Ref<const VectorXd>& s, VectorXd* f, MatrixXd* F) const {
+  if (extra_size() == 0) return;
   Keep(s, f, F);
   const Index n = state_size_, c_f = process_bias_.loadings.cols(), c_h = measurement_bias_.loadings.cols(), all = size();
   if (c_f > 0) {
@@ -82,6 +83,7 @@ void JointModel::Measurement(const Ref<const VectorXd>& s, const Ref<const Vecto
 }
 
 void JointModel::CompleteMeasurement(const Ref<const VectorXd>& s, VectorXd* h, MatrixXd* H) const {
+  if (extra_size() == 0) return;
   const Index c_h = measurement_bias_.loadings.cols();
   H->middleCols(bias_begin_, process_bias_.loadings.cols()).setZero();
   if (c_h == 0) return;

@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "absl/strings/str_cat.h"
+#include "core/base/with_count.h"
 
 namespace metaekf::filter {
 
@@ -16,81 +17,103 @@ namespace {
 constexpr Index kRowsAtATime = 32;
 constexpr double kLeastSquare = 1e-280;  // of a row's tail: what is less than 1e-140 is nothing beside any covariance, and would not divide
 
-/// Rows r ← r − γ (r v) vᵀ, for `count` of them, at most kRowsAtATime, and v in columns i … cols − 1. The count is kRows where that is
-/// known when this is compiled: small filters are made of such loops.
-/// @param rows  the first of them in column 0. @param v  v_i first, `ld` elements from one to the next; v_i itself is `v0`.
+/// Rows r ← r (I − γ v vᵀ) from column i on, for `count` of them, at most kRowsAtATime; then r_i ← −sign r_i. The count is kRows where
+/// that is known when this is compiled: small filters are made of such loops.
+/// @param rows  the first of them in column i, `ld` elements from one column to the next. @param v  v_i first, in a row of the same
+/// matrix; v_i itself is `v0`. @param length  of v.
 template <Index kRows>
-void Reflect(double* rows, Index count, Index ld, Index i, Index cols, double v0, const double* v, double gamma) {
+void Reflect(double* rows, Index count, Index ld, Index length, double sign, double v0, const double* v, double gamma) {
   if constexpr (kRows > 0) count = kRows;
   double dots[kRows > 0 ? kRows : kRowsAtATime];
-  double* const column_i = rows + i * ld;
-  for (Index k = 0; k < count; ++k) dots[k] = 0;
+  for (Index k = 0; k < count; ++k) dots[k] = rows[k] * v0;
   // Down the columns, as they lie in memory.
-  for (Index j = 1; j < cols - i; ++j) {
+  for (Index j = 1; j < length; ++j) {
     const double factor = v[j * ld];
-    const double* const column = column_i + j * ld;
+    const double* const column = rows + j * ld;
     for (Index k = 0; k < count; ++k) dots[k] += column[k] * factor;
   }
   for (Index k = 0; k < count; ++k) {
-    dots[k] = (dots[k] + column_i[k] * v0) * gamma;
-    column_i[k] -= dots[k] * v0;
+    dots[k] *= gamma;
+    rows[k] = sign * (dots[k] * v0 - rows[k]);
   }
-  for (Index j = 1; j < cols - i; ++j) {
+  for (Index j = 1; j < length; ++j) {
     const double factor = v[j * ld];
-    double* const column = column_i + j * ld;
+    double* const column = rows + j * ld;
     for (Index k = 0; k < count; ++k) column[k] -= dots[k] * factor;
   }
+}
+
+/// Makes row i zero behind the diagonal, which becomes non-negative, by one reflection of the columns from i on.
+/// @param diagonal  row i's. @param length  of the row from there on. @param below  rows below; kBelow where that is known.
+template <Index kBelow>
+void Eliminate(double* diagonal, Index ld, Index length, Index below) {
+  if constexpr (kBelow >= 0) below = kBelow;
+  // Columns that have nothing in this row stay as they are; behind a time update's Q^½, whose columns begin one after the other,
+  // that is half of the work.
+  while (length > 1 && diagonal[(length - 1) * ld] == 0) --length;
+  double squared = 0;
+  for (Index j = 1; j < length; ++j) squared += diagonal[j * ld] * diagonal[j * ld];
+  const double head = *diagonal, sign = std::copysign(1.0, head);
+  if (squared >= kLeastSquare) {
+    // I − γ v vᵀ maps the row onto −sign(head) norm e₁ with v = (head + sign(head) norm, rest), in which nothing cancels, and
+    // γ = 2 / vᵀv = 1 / (norm (norm + |head|)).
+    const double norm = std::sqrt(head * head + squared), v0 = head + sign * norm;
+    const double gamma = 1 / (norm * (norm + std::fabs(head)));
+    if constexpr (kBelow > 0) {
+      Reflect<kBelow>(diagonal + 1, below, ld, length, sign, v0, diagonal, gamma);
+    } else {
+      for (Index k = 0; k < below; k += kRowsAtATime) {
+        Reflect<0>(diagonal + 1 + k, std::min(kRowsAtATime, below - k), ld, length, sign, v0, diagonal, gamma);
+      }
+    }
+    *diagonal = norm;
+  } else {
+    for (Index k = 0; k <= below; ++k) diagonal[k] *= sign;
+  }
+  for (Index j = 1; j < length; ++j) diagonal[j * ld] = 0;
+}
+
+/// A L from a lower triangular L, n × n.
+/// @param a  rows × n, `lda` from one column to the next; so is `product`, with `ld`.
+void TimesTriangular(const double* a, Index all_rows, Index lda, const MatrixXd& l, double* product, Index ld) {
+  base::WithCount(all_rows, [&](auto rows) {
+    const Index n = l.rows();
+    for (Index j = 0; j < n; ++j, product += ld) {
+      const double* column = a + j * lda;
+      double factor = l(j, j);
+      for (Index i = 0; i < rows; ++i) product[i] = factor * column[i];
+      for (Index k = j + 1; k < n; ++k) {
+        column += lda;
+        factor = l(k, j);
+        for (Index i = 0; i < rows; ++i) product[i] += factor * column[i];
+      }
+    }
+  });
 }
 
 }  // namespace
 
 void LowerTriangularise(Ref<MatrixXd> a) {
   const Index rows = a.rows(), ld = a.outerStride();
-  double* const data = a.data();
-  for (Index i = 0; i < rows; ++i) {
-    double* const row = data + i;
-    // Columns that have nothing in row i stay as they are; behind a time update's Q^½, whose columns begin one after the other,
-    // that is half of the work.
-    Index cols = a.cols();
-    while (cols > i + 1 && row[(cols - 1) * ld] == 0) --cols;
-    // A reflection I − γ v vᵀ of columns i … that maps row i's tail onto its norm e₁: v = (head − norm, rest), γ = 2 / vᵀv = −1 / (norm v₀).
-    double squared = 0;
-    for (Index j = i + 1; j < cols; ++j) squared += row[j * ld] * row[j * ld];
-    double& diagonal = row[i * ld];
-    const double head = diagonal;
-    if (squared >= kLeastSquare) {
-      const double norm = std::sqrt(head * head + squared);
-      const bool turns = head <= 0;  // else head − norm would cancel
-      const double v0 = turns ? head - norm : -squared / (head + norm);
-      const double gamma = turns ? -1 / (norm * v0) : (head + norm) / (norm * squared);
-      const Index below = rows - i - 1;
-      double* const first = row + 1;
-      const double* const v = &diagonal;
-      switch (below) {
-        case 0:
-          break;
-        case 1:
-          Reflect<1>(first, 1, ld, i, cols, v0, v, gamma);
-          break;
-        case 2:
-          Reflect<2>(first, 2, ld, i, cols, v0, v, gamma);
-          break;
-        case 3:
-          Reflect<3>(first, 3, ld, i, cols, v0, v, gamma);
-          break;
-        case 4:
-          Reflect<4>(first, 4, ld, i, cols, v0, v, gamma);
-          break;
-        default:
-          for (Index k = 0; k < below; k += kRowsAtATime) {
-            Reflect<0>(first + k, std::min(kRowsAtATime, below - k), ld, i, cols, v0, v, gamma);
-          }
-      }
-      diagonal = norm;
-    } else if (head < 0) {
-      for (Index k = i; k < rows; ++k) data[k + i * ld] = -data[k + i * ld];
-    }
-    for (Index j = i + 1; j < cols; ++j) row[j * ld] = 0;
+  double* diagonal = a.data();
+  Index length = a.cols(), below = rows - 1;
+  const auto next = [&] { diagonal += ld + 1, --length, --below; };
+  for (; below > 4; next()) Eliminate<-1>(diagonal, ld, length, below);
+  switch (below) {
+    case 4:
+      Eliminate<4>(diagonal, ld, length, 4), next();
+      [[fallthrough]];
+    case 3:
+      Eliminate<3>(diagonal, ld, length, 3), next();
+      [[fallthrough]];
+    case 2:
+      Eliminate<2>(diagonal, ld, length, 2), next();
+      [[fallthrough]];
+    case 1:
+      Eliminate<1>(diagonal, ld, length, 1), next();
+      [[fallthrough]];
+    case 0:
+      Eliminate<0>(diagonal, ld, length, 0);
   }
 }
 
@@ -127,22 +150,22 @@ absl::StatusOr<MatrixXd> SemidefiniteFactor(const MatrixXd& a) {
 
 void FactorTimeUpdate(const MatrixXd& F, const MatrixXd& process_factor, MatrixXd* work, MatrixXd* factor) {
   const Index n = factor->rows();
-  for (Index j = 0; j < n; ++j) {
-    work->col(j) = (*factor)(j, j) * F.col(j);
-    for (Index k = j + 1; k < n; ++k) work->col(j) += (*factor)(k, j) * F.col(k);
-  }
-  work->rightCols(n) = process_factor;
+  TimesTriangular(F.data(), n, n, *factor, work->data(), n);
+  std::copy_n(process_factor.data(), n * n, work->data() + n * n);
   LowerTriangularise(*work);
-  *factor = work->leftCols(n);
+  std::copy_n(work->data(), n * n, factor->data());
 }
 
 void FactorMeasurementUpdate(const Ref<const MatrixXd>& H_rows, Ref<MatrixXd> work, MatrixXd* factor) {
-  const Index m = H_rows.rows(), n = factor->rows();
-  work.topRightCorner(m, n).noalias() = H_rows.lazyProduct(*factor);
-  work.bottomLeftCorner(n, m).setZero();
-  work.bottomRightCorner(n, n) = *factor;
+  const Index m = H_rows.rows(), n = factor->rows(), ld = work.outerStride();
+  double* column = work.data();
+  for (Index j = 0; j < m; ++j, column += ld) std::fill_n(column + m, n, 0.0);
+  TimesTriangular(H_rows.data(), m, H_rows.outerStride(), *factor, column, ld);
+  const double* from = factor->data();
+  for (Index j = 0; j < n; ++j) std::copy_n(from + j * n, n, column + j * ld + m);
   LowerTriangularise(work);
-  *factor = work.bottomRightCorner(n, n);
+  double* to = factor->data();
+  for (Index j = 0; j < n; ++j) std::copy_n(column + j * ld + m, n, to + j * n);
 }
 
 }  // namespace metaekf::filter

@@ -1,9 +1,11 @@
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstdlib>
 #include <limits>
 #include <memory>
+#include <utility>
 #include <vector>
 
 #include "core/autodiff/kernel.h"
@@ -88,7 +90,7 @@ void CheckSmallProducts() {
   base::Rng rng(14);
   const auto size = [&rng](int32_t most) { return 1 + static_cast<int32_t>(rng.Index(static_cast<size_t>(most))); };
   for (int trial = 0; trial < 600; ++trial) {
-    const int32_t m = size(18), n = size(3), k = size(trial % 2 == 0 ? 5 : 20), gap = trial % 3;
+    const int32_t m = size(trial % 7 == 0 ? 40 : 18), n = size(3), k = size(trial % 2 == 0 ? 5 : 20), gap = trial % 3;
     Instruction i{.op = Opcode::kMatMul, .rows = m, .cols = n, .inner = k, .transpose_a = trial % 4 != 0, .transpose_b = trial % 5 == 0};
     i.a.ld = (i.transpose_a ? k : m) + gap;
     i.b.ld = (i.transpose_b ? n : k) + gap;
@@ -106,6 +108,30 @@ void CheckSmallProducts() {
 
 TEST_P(KernelsTest, SmallProductsInFloat) { CheckSmallProducts<float>(); }
 TEST_P(KernelsTest, SmallProductsInDouble) { CheckSmallProducts<double>(); }
+
+/// Rows that lie one behind the other are read in whole vectors, others not.
+template <typename T>
+void CheckTallProducts() {
+  base::Rng rng(16);
+  for (int32_t m = 1; m < 50; ++m) {
+    for (int32_t k = 2; k <= 4; ++k) {
+      const std::vector<T> a = Random<T>(int64_t{m} * k, &rng), b = Random<T>(k, &rng), c = Random<T>(m, &rng);
+      std::vector<T> apart(static_cast<size_t>(m) * static_cast<size_t>(k + 1));
+      for (size_t row = 0; row < static_cast<size_t>(m); ++row) {
+        std::copy_n(a.begin() + static_cast<ptrdiff_t>(row) * k, k, apart.begin() + static_cast<ptrdiff_t>(row) * (k + 1));
+      }
+      Instruction i{.op = Opcode::kMatMulAdd, .rows = m, .cols = 1, .inner = k, .transpose_a = true};
+      i.b.ld = k, i.c.ld = i.out.ld = m;
+      i.a.ld = k;
+      const std::vector<T> together = RunKernel(i, {.out = nullptr, .a = a.data(), .b = b.data(), .c = c.data(), .panel = nullptr}, c);
+      i.a.ld = k + 1;
+      EXPECT_EQ(together, RunKernel(i, {.out = nullptr, .a = apart.data(), .b = b.data(), .c = c.data(), .panel = nullptr}, c)) << m << " × " << k;
+    }
+  }
+}
+
+TEST_P(KernelsTest, TallProductsToTheBitInFloat) { CheckTallProducts<float>(); }
+TEST_P(KernelsTest, TallProductsToTheBitInDouble) { CheckTallProducts<double>(); }
 
 /// Each element is one operation: equal to the last bit, whatever the size.
 template <typename T>
@@ -126,6 +152,39 @@ void CheckElementwise() {
     }
   }
 }
+
+/// The same where blocks of one operand are read again and again.
+template <typename T>
+void CheckTiled() {
+  base::Rng rng(17);
+  for (int trial = 0; trial < 200; ++trial) {
+    const auto size = [&rng](size_t most) { return 1 + static_cast<int32_t>(rng.Index(most)); };
+    const int32_t rows = size(40), width = size(3), count = size(4), blocks = size(3), cols = width * count * blocks;
+    const std::vector<T> whole = Random<T>(int64_t{rows} * cols, &rng), tiles = Random<T>(int64_t{rows} * width * blocks, &rng);
+    std::vector<T> repeated;
+    for (int32_t block = 0; block < blocks; ++block) {
+      for (int32_t repeat = 0; repeat < count; ++repeat) {
+        const auto begin = tiles.begin() + int64_t{block} * rows * width;
+        repeated.insert(repeated.end(), begin, begin + int64_t{rows} * width);
+      }
+    }
+    const std::vector<T> none(whole.size());
+    for (const Opcode op : {Opcode::kAdd, Opcode::kSub, Opcode::kMul}) {
+      Instruction i{.op = op, .rows = rows, .cols = cols};
+      const auto run = [&](const std::vector<T>& a, const std::vector<T>& b) {
+        return RunKernel(i, {.out = nullptr, .a = a.data(), .b = b.data(), .c = nullptr, .panel = nullptr}, none);
+      };
+      const std::vector<T> first = run(repeated, whole), second = run(whole, repeated);
+      i.a.tile_width = width, i.a.tile_count = count;
+      ASSERT_EQ(run(tiles, whole), first);
+      std::swap(i.a, i.b);
+      ASSERT_EQ(run(whole, tiles), second);
+    }
+  }
+}
+
+TEST_P(KernelsTest, TiledInFloat) { CheckTiled<float>(); }
+TEST_P(KernelsTest, TiledInDouble) { CheckTiled<double>(); }
 
 TEST_P(KernelsTest, ElementwiseInFloat) { CheckElementwise<float>(); }
 TEST_P(KernelsTest, ElementwiseInDouble) { CheckElementwise<double>(); }
