@@ -1,6 +1,7 @@
 #include "core/autodiff/evaluate.h"
 
 #include <algorithm>
+#include <cstdlib>
 #include <new>
 
 #include "absl/container/inlined_vector.h"
@@ -25,6 +26,85 @@ std::vector<Kernel<T>> SelectKernels(const std::vector<Instruction>& instruction
   std::vector<Kernel<T>> kernels;
   for (const Instruction& i : instructions) kernels.push_back(SelectKernel<T>(i));
   return kernels;
+}
+
+/// Whether each element of out is made of the elements of a, and of b, at the same place.
+bool IsElementwise(const Instruction& i) {
+  switch (i.op) {
+    case Opcode::kAdd:
+    case Opcode::kSub:
+    case Opcode::kMul:
+    case Opcode::kScale:
+    case Opcode::kActivation:
+      return i.a.tile_width == 0 && i.b.tile_width == 0;
+    default:
+      return false;
+  }
+}
+
+/// Whether `elements` at two places are the same ones or have none in common.
+bool SameOrApart(const Operand& one, const Operand& other, int64_t elements) {
+  return one.slot != other.slot || one.offset == other.offset || std::abs(one.offset - other.offset) >= elements;
+}
+
+bool ReadsTwo(const Instruction& i) {
+  if (i.op == Opcode::kActivation) return i.activation == Activation::kSwish;
+  return i.op != Opcode::kScale;
+}
+
+/// Whether an elementwise instruction may begin before another is done, of which the same elements are.
+bool MayFollow(const Instruction& i, const Instruction& before, int64_t elements) {
+  const auto apart = [elements](const Instruction& reader, const Operand& out) {
+    return SameOrApart(reader.a, out, elements) && (!ReadsTwo(reader) || SameOrApart(reader.b, out, elements));
+  };
+  return apart(i, before.out) && apart(before, i.out) && SameOrApart(i.out, before.out, elements);
+}
+
+/// Of the same values on less: the first so many elements.
+Instruction PieceOf(Instruction i, int64_t elements) {
+  i.rows = static_cast<int32_t>(elements);
+  i.cols = 1;
+  return i;
+}
+
+std::vector<Chain> ChainsOf(const std::vector<Instruction>& all) {
+  std::vector<Chain> chains;
+  const auto elements = [&all](size_t k) { return int64_t{all[k].rows} * all[k].cols; };
+  for (size_t first = 0; first < all.size();) {
+    size_t end = first;
+    const auto goes_on = [&] {
+      if (end == all.size() || !IsElementwise(all[end]) || elements(end) != elements(first)) return false;
+      return std::all_of(all.begin() + static_cast<ptrdiff_t>(first), all.begin() + static_cast<ptrdiff_t>(end),
+                         [&](const Instruction& before) { return MayFollow(all[end], before, elements(first)); });
+    };
+    while (goes_on()) ++end;
+    if (end - first > 1 && elements(first) > Chain::kPiece) {
+      Chain chain{.first = first, .length = end - first, .elements = elements(first)};
+      for (size_t k = first; k < end; ++k) {
+        chain.pieces.push_back(PieceOf(all[k], Chain::kPiece));
+        chain.ends.push_back(PieceOf(all[k], chain.elements % Chain::kPiece));
+      }
+      chains.push_back(std::move(chain));
+    }
+    first = std::max(end, first + 1);
+  }
+  return chains;
+}
+
+template <typename T>
+void RunChain(const Chain& chain, const Step<T>* steps, const Memory<T>& memory) {
+  const auto run = [&](const std::vector<Instruction>& instructions, int64_t begin) {
+    for (size_t k = 0; k < chain.length; ++k) {
+      Places<T> at = memory.PlacesOf(steps[k]);
+      at.out += begin;
+      at.a += begin;
+      at.b += begin;
+      steps[k].run(instructions[k], at);
+    }
+  };
+  int64_t begin = 0;
+  for (; begin + Chain::kPiece <= chain.elements; begin += Chain::kPiece) run(chain.pieces, begin);
+  if (begin < chain.elements) run(chain.ends, begin);
 }
 
 template <typename T>
@@ -137,7 +217,7 @@ AlignedBuffer<T>::AlignedBuffer(int64_t elements)
 
 template <typename T>
 Executable<T>::Executable(Program program)
-    : program_(std::move(program)), steps_(StepsOf<T>(program_.instructions)), constants_(program_.constants_size) {
+    : program_(std::move(program)), steps_(StepsOf<T>(program_.instructions)), chains_(ChainsOf(program_.instructions)), constants_(program_.constants_size) {
   for (const Loop& loop : program_.loops) loop_kernels_.push_back(SelectKernels<T>(loop.instructions));
   for (const Program::ConstantBlock& block : program_.constants) {
     T* target = constants_.data() + block.offset;
@@ -172,7 +252,14 @@ template <typename T>
 void Evaluate(const Executable<T>& executable, const Slots<T>& slots, const Arena<T>& arena, const Packed<T>* packed) {
   const Memory<T> memory(arena.data(), executable.constants(), slots);
   if (packed == nullptr) {
-    for (const Step<T>& step : executable.steps()) RunStep(executable, step, memory, arena);
+    const Step<T>* const steps = executable.steps().data();
+    size_t next = 0;
+    for (const Chain& chain : executable.chains()) {
+      for (; next < chain.first; ++next) RunStep(executable, steps[next], memory, arena);
+      RunChain(chain, steps + next, memory);
+      next += chain.length;
+    }
+    for (; next < executable.steps().size(); ++next) RunStep(executable, steps[next], memory, arena);
     return;
   }
   const T* const* factor = packed->data();

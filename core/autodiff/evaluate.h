@@ -55,6 +55,15 @@ struct Step {
   Operand out, a, b, c;
 };
 
+/// Elementwise instructions on as many elements each, one behind the other in a program, which run piece by piece: what one of them makes
+/// is then still near when the next reads it.
+struct Chain {
+  size_t first = 0, length = 0;  ///< instructions
+  std::vector<Instruction> pieces, ends;  ///< on kPiece elements, and on what is left then
+  int64_t elements = 0;
+  static constexpr int64_t kPiece = 1024;
+};
+
 /// A program with its constants in place and a kernel for each instruction: what runs. Never changes, so threads may share it.
 template <typename T>
 class Executable {
@@ -64,12 +73,14 @@ class Executable {
   const Program& program() const { return program_; }
   const std::vector<Step<T>>& steps() const { return steps_; }
   const std::vector<std::vector<Kernel<T>>>& loop_kernels() const { return loop_kernels_; }
+  const std::vector<Chain>& chains() const { return chains_; }
   const T* constants() const { return constants_.data(); }
 
  private:
   Program program_;
   std::vector<Step<T>> steps_;
   std::vector<std::vector<Kernel<T>>> loop_kernels_;
+  std::vector<Chain> chains_;
   AlignedBuffer<T> constants_;
 };
 
