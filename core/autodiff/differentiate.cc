@@ -155,6 +155,14 @@ class ForwardMode {
   /// A primal value beside tangents: repeated for every direction.
   Value Repeat(Value v) { return graph_.Tile(v, graph_.node(v).cols, directions_); }
 
+  /// The tangent of a sum; what is added to a product's two tangents goes to the first of them, which then needs no pass of its own for it.
+  Value SumOf(Value a, Value b) {
+    if (a == kNoValue || b == kNoValue || graph_.node(a).op != Op::kAdd) return graph_.AddOrEither(a, b);
+    const Value first = graph_.node(a).inputs[0], second = graph_.node(a).inputs[1];
+    if (graph_.node(first).op != Op::kMatMul || graph_.node(second).op != Op::kMatMul) return graph_.Add(a, b);
+    return graph_.Add(graph_.Add(first, b), second);
+  }
+
   Value Rule(Value v, const Node& node) {
     const auto t = [&](size_t i) { return tangent(node.inputs[i]); };
     switch (node.op) {
@@ -175,7 +183,7 @@ class ForwardMode {
         return graph_.AddOrEither(from_a, from_b);
       }
       case Op::kAdd:
-        return graph_.AddOrEither(t(0), t(1));
+        return SumOf(t(0), t(1));
       case Op::kSub:
         return graph_.AddOrEither(t(0), t(1) == kNoValue ? kNoValue : graph_.Scale(t(1), -1));
       case Op::kMul:
