@@ -98,7 +98,7 @@ void LowerTriangularise(Ref<MatrixXd> a) {
   double* diagonal = a.data();
   Index length = a.cols(), below = rows - 1;
   const auto next = [&] { diagonal += ld + 1, --length, --below; };
-  for (; below > 4; next()) Eliminate<-1>(diagonal, ld, length, below);
+  while (below > 4) Eliminate<-1>(diagonal, ld, length, below), next();
   switch (below) {
     case 4:
       Eliminate<4>(diagonal, ld, length, 4), next();
