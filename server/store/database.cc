@@ -10,7 +10,8 @@ namespace metaekf::store {
 namespace {
 
 constexpr int kLockTimeoutMs = 5000;
-constexpr size_t kIdleReaders = 4;  // others are closed after use
+// Open from the start, so that what a server holds does not depend on how many have once read at a time. Others are closed after use.
+constexpr size_t kIdleReaders = 4;
 
 int Bind(sqlite3_stmt* statement, int index, const Value& value) {
   if (const auto* number = std::get_if<int64_t>(&value)) {
@@ -138,7 +139,13 @@ absl::StatusOr<std::unique_ptr<Database>> Database::Open(const std::string& path
   METAEKF_RETURN_IF_ERROR(
       writer->Execute("PRAGMA quick_check(1)", {}, [&](const Row& row) { verdict = row.Text(0); }));
   if (verdict != "ok") return absl::DataLossError(absl::StrCat("database: damaged: ", verdict));
-  return std::unique_ptr<Database>(new Database(path, std::move(writer)));
+  std::unique_ptr<Database> database(new Database(path, std::move(writer)));
+  for (size_t i = 0; i < kIdleReaders; ++i) {
+    METAEKF_ASSIGN_OR_RETURN(auto reader, Connection::Open(path, Connection::Mode::kReadOnly));
+    METAEKF_RETURN_IF_ERROR(reader->Execute("SELECT count(*) FROM sqlite_schema"));  // opens its files
+    database->idle_readers_.push_back(std::move(reader));
+  }
+  return database;
 }
 
 absl::Status Database::WriteTransaction(const Transaction& work) {

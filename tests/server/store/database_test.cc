@@ -2,7 +2,10 @@
 
 #include <gtest/gtest.h>
 
+#include <filesystem>
 #include <fstream>
+#include <functional>
+#include <iterator>
 
 #include "tests/server/store/test_store.h"
 
@@ -45,6 +48,22 @@ TEST_F(DatabaseTest, ValuesComeBackAsTheyWere) {
   ASSERT_TRUE(read.ok()) << read;
   EXPECT_EQ(rows,
             (std::vector<std::pair<int64_t, std::string>>{{int64_t{1} << 62, bytes}, {0, "text"}}));
+}
+
+TEST_F(DatabaseTest, FourReadersAtATimeLeaveNoMoreFilesOpen) {
+  const auto open_files = [] {
+    const std::filesystem::directory_iterator all("/proc/self/fd");
+    return std::distance(begin(all), end(all));
+  };
+  const auto before = open_files();
+  const std::function<void(int)> read_within = [&](int more) {
+    EXPECT_TRUE(database_->Read([&](Connection& c) {
+      if (more > 0) read_within(more - 1);
+      return c.Execute("SELECT count(*) FROM t");
+    }).ok());
+  };
+  read_within(3);
+  EXPECT_EQ(open_files(), before);
 }
 
 TEST_F(DatabaseTest, AnErrorUndoesTheWholeTransaction) {
