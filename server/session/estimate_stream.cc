@@ -13,8 +13,10 @@ using std::chrono::steady_clock;
 namespace {
 
 constexpr std::chrono::seconds kSlowReader(10);      // a response that waits longer ends the stream
-// Longer batches go to threads of their own. To wake one costs as much as 64 samples of a small model.
+// Longer batches go to threads of their own, and so do those of more rows than a few while many come. To wake a thread costs as much as
+// 64 samples of a small model.
 constexpr std::chrono::microseconds kLongReaction(200);
+constexpr int64_t kFewRows = 8;
 
 // Messages up to here are a part of what a session takes; larger ones are counted, and their memory is not kept for the next.
 constexpr int64_t kSmallBytes = 8 << 10;
@@ -182,8 +184,8 @@ bool EstimateStream::MayWork() const {
 }
 
 void EstimateStream::StartWork() {
-  if (live_ != nullptr && ValuesOf(work_) * time_per_value_ <= kLongReaction && (!Queues() || live_->queue->Enter())) {
-    // The batch is short: applied in this reaction, but without the mutex, which the caller holds. Reading on waits for the response
+  if (live_ != nullptr && IsShort() && (!Queues() || live_->queue->Enter())) {
+    // Applied in this reaction, but without the mutex, which the caller holds. Reading on waits for the response
     // to be on its way, which a single sensor's latency is made of.
     mutex_.unlock();
     const absl::Status status = Apply();
@@ -204,12 +206,17 @@ void EstimateStream::StartWork() {
   if (!accepted) WorkDone(Overloaded());
 }
 
+bool EstimateStream::IsShort() {
+  const int64_t values = ValuesOf(work_);
+  return values * time_per_value_ <= kLongReaction && (values <= kFewRows * output_size_ || !service_.crowd_.Joins(steady_clock::now(), &rush_));
+}
+
 bool EstimateStream::Queues() const { return work_.has_samples() && live_->queue->model()->is_large(); }
 
 void EstimateStream::Applied(const absl::Status& status, steady_clock::duration cost) {
   if (response_.estimates().nis_size() > 0) {
     service_.sessions_.MarkDirty(live_);
-    time_per_value_ = cost / (int64_t{response_.estimates().nis_size()} * output_size_);
+    TookPerValue(cost / (int64_t{response_.estimates().nis_size()} * output_size_));
   }
   std::lock_guard lock(mutex_);
   WorkDone(status);
@@ -296,8 +303,8 @@ absl::Status EstimateStream::OpenOrResume() {
     opened->set_durable_seq((*live)->durable_seq);
     output_size_ = opened->output_size();
     row_bytes_ = (*live)->session->row_bytes();
-    // A batch of the largest models takes about 20 ns per parameter and output; measured from the first batch on.
-    time_per_value_ = std::chrono::nanoseconds(
+    // A batch of the largest models takes about 20 ns per parameter and output; measured from then on.
+    time_per_value_ = last_time_per_value_ = std::chrono::nanoseconds(
         static_cast<int64_t>((*live)->session->model().bundle.parameters.size()));
   }
   std::lock_guard lock(mutex_);
@@ -336,8 +343,14 @@ absl::Status EstimateStream::Apply() {
   live_->queue->GiveBack(std::move(scratch));
   if (applied) service_.sessions_.MarkDirty(live_);
   const int64_t values = output_size_ * (int64_t{response_.estimates().nis_size()} + response_.forecast().nis_size());
-  if (values > 0) time_per_value_ = (steady_clock::now() - start) / values;
+  if (values > 0) TookPerValue((steady_clock::now() - start) / values);
   return status;
+}
+
+void EstimateStream::TookPerValue(steady_clock::duration time) {
+  // The less of two: who was interrupted is not slow, and a batch that is taken for long has to wait for long ones.
+  time_per_value_ = std::min(time, last_time_per_value_);
+  last_time_per_value_ = time;
 }
 
 }  // namespace metaekf::server

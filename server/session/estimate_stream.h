@@ -60,6 +60,9 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   void Account();
   /// After each batch.
   void Count(const v1::EstimateBatch& estimates);
+  /// Whether work_ may be done in a reaction: others wait meanwhile.
+  bool IsShort();
+  void TookPerValue(std::chrono::steady_clock::duration time);
   /// Whether batches of many sessions of this model are applied together where they wait.
   bool Queues() const;
   /// Whether what comes next may be worked on. Beyond its tenant's rate a request waits, and with it the client; so it does where its
@@ -88,7 +91,8 @@ class EstimateStream : public grpc::ServerBidiReactor<v1::EstimateRequest, v1::E
   std::shared_ptr<LiveSession> live_;
   int64_t output_size_ = 0;
   int64_t row_bytes_ = 0;
-  std::chrono::steady_clock::duration time_per_value_{};  // of outputs in a batch, as last measured
+  std::chrono::steady_clock::duration time_per_value_{}, last_time_per_value_{};  // of outputs in a batch, as measured
+  uint64_t rush_ = 0;  // for Crowd
 
   std::mutex mutex_;  // guards everything; batches themselves are applied without it
   bool reading_ = false;

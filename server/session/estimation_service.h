@@ -11,6 +11,7 @@
 #include "metaekf/v1/estimation.grpc.pb.h"
 #include "server/executor/background_executor.h"
 #include "server/handlers/service_context.h"
+#include "server/session/crowd.h"
 #include "server/session/sample_rate.h"
 #include "server/session/session_manager.h"
 
@@ -59,7 +60,8 @@ class EstimationService : public v1::EstimationService::CallbackService {
   SessionManager& sessions_;
   SampleRates rates_;
   std::atomic<int64_t> held_bytes_ = 0;
-  BackgroundExecutor heavy_;  // batches that take longer than a reaction may; each stream has one at most
+  Crowd crowd_;  // of batches that a reaction may do
+  BackgroundExecutor heavy_;  // batches that a reaction may not do; each stream has one at most
 
   std::mutex mutex_;
   std::condition_variable changed_;

@@ -61,8 +61,8 @@ class BombsTest : public ::testing::Test {
     const std::vector<double>& all = neighbour_->latencies_ms();
     const auto quiet_end = all.begin() + std::min(kQuietAnswers, std::ssize(all));
     const std::vector<double> quiet(all.begin(), quiet_end), bombed(quiet_end, all.end());
-    std::printf("memory %.1f MB, at most %.1f MB more; a neighbour's p99 %.2f ms, before %.2f ms (%zu and %td samples)\n", before_mb_,
-                growth_mb, Percentile99(bombed), Percentile99(quiet), bombed.size(), kQuietAnswers);
+    std::printf("memory %.1f MB, at most %.1f MB more; a neighbour's p99 %.2f ms, %.2f ms in the worst %zu of %zu answers; before %.2f ms\n",
+                before_mb_, growth_mb, Percentile99(bombed), WorstRound(bombed), kNeighbourRound, bombed.size(), Percentile99(quiet));
     EXPECT_EQ(server_.End(SIGTERM).code, 0);
   }
 
@@ -83,6 +83,16 @@ class BombsTest : public ::testing::Test {
   static double Percentile99(std::vector<double> values) {
     std::sort(values.begin(), values.end());
     return values.empty() ? 0 : values[values.size() * 99 / 100];
+  }
+
+  /// The highest p99 of answers that follow each other: bombs may be short.
+  static double WorstRound(const std::vector<double>& values) {
+    double worst = 0;
+    for (auto from = values.begin(); from < values.end(); from += std::min<ptrdiff_t>(kNeighbourRound, values.end() - from)) {
+      const auto to = from + std::min<ptrdiff_t>(kNeighbourRound, values.end() - from);
+      worst = std::max(worst, Percentile99({from, to}));
+    }
+    return worst;
   }
 
   /// Of resident memory, as the kernel keeps it.
