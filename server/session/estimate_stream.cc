@@ -1,5 +1,7 @@
 #include "server/session/estimate_stream.h"
 
+#include <algorithm>
+
 #include "absl/strings/str_cat.h"
 #include "core/base/status.h"
 #include "server/handlers/overload.h"

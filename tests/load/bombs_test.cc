@@ -15,6 +15,7 @@
 #include <fstream>
 #include <functional>
 #include <optional>
+#include <span>
 #include <thread>
 
 #include "absl/strings/numbers.h"
@@ -88,9 +89,9 @@ class BombsTest : public ::testing::Test {
   /// The highest p99 of answers that follow each other: bombs may be short.
   static double WorstRound(const std::vector<double>& values) {
     double worst = 0;
-    for (auto from = values.begin(); from < values.end(); from += std::min<ptrdiff_t>(kNeighbourRound, values.end() - from)) {
-      const auto to = from + std::min<ptrdiff_t>(kNeighbourRound, values.end() - from);
-      worst = std::max(worst, Percentile99({from, to}));
+    for (size_t first = 0; first < values.size(); first += kNeighbourRound) {
+      const std::span<const double> round = std::span(values).subspan(first, std::min(kNeighbourRound, values.size() - first));
+      worst = std::max(worst, Percentile99({round.begin(), round.end()}));
     }
     return worst;
   }
