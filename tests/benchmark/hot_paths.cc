@@ -1,5 +1,7 @@
 // Runs one hot path by name, for callgrind to count its instructions (check_instruction_counts).
 
+#include <hwy/nanobenchmark.h>
+
 #include <cstdio>
 #include <functional>
 #include <map>
@@ -13,6 +15,10 @@
 
 /// What callgrind counts: it collects inside the function of this name only.
 extern "C" [[gnu::noipa]] void MeasuredHotPath(const std::function<void()>& work) { work(); }
+
+/// In the place of the library's, which it calls as it loads and nobody here needs: that one executes rdtscp, which valgrind refuses where
+/// the processor does not announce it, as in some virtual machines.
+uint64_t hwy::platform::TimerResolution() { return 1; }
 
 namespace metaekf {
 namespace {
