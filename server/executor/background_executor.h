@@ -26,6 +26,7 @@ class BackgroundExecutor {
   /// Queues `task`. False if the queue is full: shed the work.
   [[nodiscard]] bool Submit(std::function<void()> task);
   size_t queued() const;
+  bool is_full() const { return queued() >= max_queued_; }
 
  private:
   void Run(bool gives_way);

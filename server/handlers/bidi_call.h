@@ -30,7 +30,11 @@ class BidiCall final : public grpc::ServerBidiReactor<Request, Response>,
            std::unique_ptr<StreamHandler<Request, Response>> handler,
            BackgroundExecutor& at_request, BackgroundExecutor& at_end)
       : context_(context), record_(std::move(record)), handler_(std::move(handler)), at_request_(at_request), at_end_(at_end) {
-    this->StartRead(&request_);
+    if (at_end.is_full()) {  // what would be refused at its end need not be sent first
+      this->Finish(record_->End(Overloaded()));
+    } else {
+      this->StartRead(&request_);
+    }
   }
 
   void OnReadDone(bool ok) override {

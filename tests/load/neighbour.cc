@@ -6,7 +6,9 @@
 // Prints a line after every kNeighbourRound answers, and at the end: how long each took, in ms. Ends with SIGTERM; with status 1 and
 // the reason if it was not served.
 
+#include <fcntl.h>
 #include <signal.h>
+#include <unistd.h>
 
 #include <chrono>
 #include <cstdio>
@@ -72,5 +74,7 @@ int main(int argc, char** argv) {
     return 2;
   }
   signal(SIGTERM, [](int) { metaekf::server::ended = 1; });
+  // Whoever reads may do so at the end only.
+  if (fcntl(STDOUT_FILENO, F_SETPIPE_SZ, 1 << 20) < 0) std::perror("neighbour: a larger pipe");
   return metaekf::server::Run(argv[1], std::atof(argv[2]));
 }
