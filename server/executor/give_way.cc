@@ -92,6 +92,12 @@ void GiveWay() {
   TheProcessors().Join();
 }
 
+unsigned UsableProcessors() {
+  cpu_set_t processors;
+  if (sched_getaffinity(0, sizeof(processors), &processors) != 0) return 1;
+  return static_cast<unsigned>(CPU_COUNT(&processors));
+}
+
 FreeProcessor::FreeProcessor() { TheProcessors().Keep(1); }
 FreeProcessor::~FreeProcessor() { TheProcessors().Keep(-1); }
 

@@ -8,6 +8,9 @@ namespace metaekf::server {
 /// last, beside estimates, which someone waits for. Where the system refuses, it works all the same, only less politely.
 void GiveWay();
 
+/// How many processors the calling thread may use. (std::thread::hardware_concurrency() counts those that it may not, too.)
+unsigned UsableProcessors();
+
 /// While one lives, threads of this process that GiveWay, and processes that were added, leave one of the processors free, if they may
 /// use several: priority alone has whoever wakes up wait for milliseconds.
 class FreeProcessor {

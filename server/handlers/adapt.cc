@@ -1,7 +1,6 @@
 #include <algorithm>
 #include <memory>
 #include <optional>
-#include <thread>
 #include <utility>
 
 #include "absl/strings/str_cat.h"
@@ -11,6 +10,7 @@
 #include "core/nssm/model_file.h"
 #include "server/convert/adaptations.h"
 #include "server/convert/samples.h"
+#include "server/executor/give_way.h"
 #include "server/handlers/adaptation_handlers.h"
 #include "server/metrics/metrics.h"
 #include "server/names/resource_names.h"
@@ -58,7 +58,7 @@ class AdaptCall final : public StreamHandler<Request, Response> {
       return absl::OkStatus();
     }
     const absl::Time start = absl::Now();
-    const auto executor = base::MakeThreadExecutor(std::clamp(std::thread::hardware_concurrency(), 1U, kMaxThreads));
+    const auto executor = base::MakeThreadExecutor(std::min(UsableProcessors(), kMaxThreads));
     meta::AdaptationOptions options = options_;
     options.executor = executor.get();
     METAEKF_ASSIGN_OR_RETURN(meta::AdaptationResult result,

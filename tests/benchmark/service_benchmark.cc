@@ -207,52 +207,76 @@ double ResidentKib(pid_t pid) {
 /// Of streams that take turns, as many messages in flight as ever.
 template <class Stream>
 double RateOfTurns(const std::vector<std::unique_ptr<Stream>>& streams) {
-  for (const auto& stream : streams) stream->Send(), stream->Receive();  // until everything is warm
-  std::vector<double> rates;
-  for (int round = 0; round < kRounds; ++round) {
-    size_t out = 0, in = 0;
-    rates.push_back(MessagesPerSecond(kMessagesInFlight, kSecondsPerRound, [&] { streams[out++ % streams.size()]->Send(); },
-                                      [&] { streams[in++ % streams.size()]->Receive(); }));
-  }
-  return Median(rates);
+  size_t out = 0, in = 0;
+  return MessagesPerSecond(kMessagesInFlight, kSecondsPerRound, [&] { streams[out++ % streams.size()]->Send(); },
+                           [&] { streams[in++ % streams.size()]->Receive(); });
 }
 
-/// More and more sessions, and as many streams of the echo.
-std::vector<Row> Growth(const ServerProcess& server, const std::string& echo) {
-  std::vector<double> echoed;
-  {
-    std::vector<std::unique_ptr<EchoStream>> streams;
-    std::shared_ptr<grpc::Channel> connection;
-    for (const size_t sessions : kSessions) {
-      for (; streams.size() < sessions; streams.push_back(std::make_unique<EchoStream>(connection, SizesOf(1)))) {
-        if (streams.size() % kSessionsPerConnection == 0) connection = ConnectionTo(echo);
+/// A server with so many sessions, and an echo server with as many streams.
+class GrownServer {
+ public:
+  GrownServer(const std::string& data_directory, size_t sessions)
+      : server_(ServerProcess::Metaekfd(data_directory)), echo_(METAEKF_ECHO_BINARY, {}) {
+    Check(client::Client({.server = server_.address()}).ImportModel("van-der-pol", ZooModel()).status(), "importing");
+    std::vector<double> opening_ms;
+    while (streams_.size() < sessions) {
+      if (streams_.size() % kSessionsPerConnection == 0) {
+        connections_.push_back(std::make_unique<client::Client>(client::Options{.server = server_.address()}));
+        (void)connections_.back()->GetServerInfo();  // connected
       }
-      echoed.push_back(RateOfTurns(streams));
+      const steady_clock::time_point begin = steady_clock::now();
+      streams_.push_back(std::make_unique<EstimateStream>(connections_.back().get(), 1));
+      opening_ms.push_back(1e3 * SecondsSince(begin));
     }
+    opening_ms_ = Median(opening_ms);
+    std::shared_ptr<grpc::Channel> connection;
+    for (; echo_streams_.size() < sessions; echo_streams_.push_back(std::make_unique<EchoStream>(connection, SizesOf(1)))) {
+      if (echo_streams_.size() % kSessionsPerConnection == 0) connection = ConnectionTo(echo_.address());
+    }
+    for (const auto& stream : streams_) stream->Send(), stream->Receive();  // until everything is warm
+    for (const auto& stream : echo_streams_) stream->Send(), stream->Receive();
   }
-  std::vector<std::unique_ptr<client::Client>> connections;
-  std::vector<std::unique_ptr<EstimateStream>> streams;
+
+  void Measure() {
+    rates_.push_back(RateOfTurns(streams_));
+    echo_rates_.push_back(RateOfTurns(echo_streams_));
+  }
+
+  size_t sessions() const { return streams_.size(); }
+  double opening_ms() const { return opening_ms_; }
+  double rate() const { return Median(rates_); }
+  double echo_rate() const { return Median(echo_rates_); }
+  double resident_kib() const { return ResidentKib(server_.pid()); }
+
+ private:
+  ServerProcess server_, echo_;
+  std::vector<std::unique_ptr<client::Client>> connections_;
+  std::vector<std::unique_ptr<EstimateStream>> streams_;
+  std::vector<std::unique_ptr<EchoStream>> echo_streams_;
+  double opening_ms_ = 0;
+  std::vector<double> rates_, echo_rates_;
+};
+
+/// More and more sessions, and as many streams of the echo. Measured in turns: what a host does meanwhile changes more than what sets them apart.
+std::vector<Row> Growth(const std::filesystem::path& data) {
+  std::vector<std::unique_ptr<GrownServer>> servers;
+  for (const size_t sessions : kSessions) {
+    servers.push_back(std::make_unique<GrownServer>((data / ("growth-" + std::to_string(sessions))).string(), sessions));
+  }
+  for (int round = 0; round < kRounds; ++round) {
+    for (const auto& server : servers) server->Measure();
+  }
   std::vector<Row> rows;
   double before_kib = 0;
   size_t before = 0;
-  for (const size_t sessions : kSessions) {
-    std::vector<double> opening_ms;
-    while (streams.size() < sessions) {
-      if (streams.size() % kSessionsPerConnection == 0) {
-        connections.push_back(std::make_unique<client::Client>(client::Options{.server = server.address()}));
-        (void)connections.back()->GetServerInfo();  // connected
-      }
-      const steady_clock::time_point begin = steady_clock::now();
-      streams.push_back(std::make_unique<EstimateStream>(connections.back().get(), 1));
-      opening_ms.push_back(1e3 * SecondsSince(begin));
-    }
-    const double rate = RateOfTurns(streams), peer = echoed[rows.size() / 3];
-    const double kib = ResidentKib(server.pid());
-    const std::string of = std::to_string(sessions) + " sessions, ";
-    rows.push_back({of + "estimates", "1/s", rate, peer, rate / peer, ""});
-    rows.push_back({of + "opening one", "ms", Median(opening_ms), kNaN, kNaN, ""});
-    rows.push_back({of + "server memory of each more", "KiB", before > 0 ? (kib - before_kib) / static_cast<double>(sessions - before) : kNaN, kNaN, kNaN, ""});
-    before = sessions;
+  for (const auto& server : servers) {
+    const std::string of = std::to_string(server->sessions()) + " sessions, ";
+    const double kib = server->resident_kib();
+    rows.push_back({of + "estimates", "1/s", server->rate(), server->echo_rate(), server->rate() / server->echo_rate(), ""});
+    rows.push_back({of + "opening one", "ms", server->opening_ms(), kNaN, kNaN, ""});
+    rows.push_back({of + "server memory of each more", "KiB",
+                    before > 0 ? (kib - before_kib) / static_cast<double>(server->sessions() - before) : kNaN, kNaN, kNaN, ""});
+    before = server->sessions();
     before_kib = kib;
   }
   return rows;
@@ -340,15 +364,7 @@ int Main(const std::string& only, const std::string& json) {
     server_off.End(SIGTERM);
     return rows;
   });
-  report("Growth", [&] {
-    ServerProcess server = ServerProcess::Metaekfd((data / "growth").string()), echo(METAEKF_ECHO_BINARY, {});
-    client::Client client({.server = server.address()});
-    Check(client.ImportModel("van-der-pol", ZooModel()).status(), "importing");
-    std::vector<Row> rows = Growth(server, echo.address());
-    server.End(SIGTERM);
-    echo.End(SIGTERM);
-    return rows;
-  });
+  report("Growth", [&] { return Growth(data); });
   report("Start", [&] { return Start((data / "start").string()); });
   std::filesystem::remove_all(data);
   if (all.empty()) Fail("there is no table " + only + "; there are Streams, Latency, Large, Checkpoints, Growth and Start");

@@ -47,6 +47,7 @@ TEST_F(FreeProcessorTest, ThreadsThatGiveWayLeaveOneWhileItIsKept) {
     std::thread([&] {
       GiveWay();
       EXPECT_EQ(Processors(0), all_ - 1) << "one that begins meanwhile";
+      EXPECT_EQ(UsableProcessors(), static_cast<unsigned>(all_ - 1));
     }).join();
   }
   EXPECT_EQ(Processors(thread), all_);
