@@ -6,6 +6,7 @@
 #include <functional>
 #include <map>
 #include <string>
+#include <vector>
 
 #include "core/meta/adapt.h"
 #include "server/session/session.h"
@@ -56,9 +57,14 @@ void Adaptation() {
   MeasuredHotPath([&] { (void)meta::AdaptedBundle(bundle, context, spec).value(); });
 }
 
-/// A batch of a stream, from the bytes of its request to those of its response.
-void EstimateBatch() {
-  constexpr int kBatch = 64;
+/// Reads so much that what was in the caches is no more, callgrind's too.
+void EmptyCaches() {
+  static std::vector<char> large(size_t{64} << 20);
+  for (size_t i = 0; i < large.size(); i += 64) ++large[i];
+}
+
+/// A batch of a stream, from the bytes of its request to those of its response; once it has run, and again after `before`.
+void Estimate(int samples, const std::function<void()>& before) {
   auto model = std::make_shared<server::ServedModel>(server::ServedModel{.bundle = ZooModel("van-der-pol")});
   model->filter_model = filter::FilterModel::Create(model->bundle);
   model->filter_parameters = model->filter_model->Prepare(model->bundle);
@@ -66,13 +72,13 @@ void EstimateBatch() {
   v1::OpenSession open;
   open.set_covariance_format(v1::OpenSession::DIAGONAL);
   const auto session = server::Session::Open(model, open).value();
-  const Eigen::MatrixXd outputs = Oscillation(2 * kBatch);
+  const Eigen::MatrixXd outputs = Oscillation(2 * samples);
   uint64_t next = 1;
   const auto apply = [&] {
     v1::EstimateRequest request;
     request.mutable_samples()->set_first_seq(next);
     const double* const from = outputs.col(static_cast<Eigen::Index>(next) - 1).data();
-    request.mutable_samples()->mutable_outputs()->Add(from, from + outputs.rows() * kBatch);
+    request.mutable_samples()->mutable_outputs()->Add(from, from + outputs.rows() * samples);
     const std::string bytes = request.SerializeAsString();
     v1::EstimateRequest received;
     v1::EstimateResponse response;
@@ -81,18 +87,24 @@ void EstimateBatch() {
       std::exit(1);
     }
     (void)response.SerializeAsString();
-    next += kBatch;
+    next += static_cast<uint64_t>(samples);
   };
   apply();
+  before();
   MeasuredHotPath(apply);
 }
+
+void EstimateBatch() { Estimate(64, [] {}); }
+
+void EstimateCold() { Estimate(1, EmptyCaches); }
 
 int Main(const std::string& name) {
   const std::map<std::string, std::function<void()>> paths = {{"ekf-step-small", SmallStep},
                                                               {"ekf-step-large", LargeStep},
                                                               {"rollout-gradient", RolloutGradient},
                                                               {"adaptation", Adaptation},
-                                                              {"estimate-batch", EstimateBatch}};
+                                                              {"estimate-batch", EstimateBatch},
+                                                              {"estimate-cold", EstimateCold}};
   const auto path = paths.find(name);
   if (path == paths.end()) {
     std::fprintf(stderr, "usage: hot_paths NAME, which is one of");
