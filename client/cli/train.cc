@@ -1,4 +1,5 @@
 #include <google/protobuf/util/json_util.h>
+#include <nlohmann/json.hpp>
 
 #include "client/cli/commands.h"
 #include "client/cli/data_files.h"

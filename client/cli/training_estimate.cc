@@ -1,5 +1,6 @@
 #include "client/cli/training_estimate.h"
 
+#include <nlohmann/json.hpp>
 #include <sys/resource.h>
 
 #include <algorithm>

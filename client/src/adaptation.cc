@@ -2,7 +2,7 @@
 
 namespace metaekf::client {
 
-using Stub = v1::AdaptationService::Stub;
+using v1::AdaptationService;
 
 Result<Adaptation> Client::Adapt(const AdaptationRequest& request,
                                  const std::function<bool(const AdaptationProgress&)>& on_step) {
@@ -47,12 +47,12 @@ Result<Adaptation> Client::GetAdaptation(const std::string& id) {
   METAEKF_CLIENT_ASSIGN_OR_RETURN(*request.mutable_name(), Resource("adaptations", id));
   v1::Adaptation response;
   METAEKF_CLIENT_RETURN_IF_ERROR(
-      impl_->Call(impl_->adaptations, &Stub::GetAdaptation, request, &response));
+      impl_->Call(impl_->adaptations, &AdaptationService::Stub::GetAdaptation, request, &response));
   return FromProto(response);
 }
 
 Result<std::vector<Adaptation>> Client::ListAdaptations() {
-  return impl_->List<Adaptation>(impl_->adaptations, &Stub::ListAdaptations,
+  return impl_->List<Adaptation>(impl_->adaptations, &AdaptationService::Stub::ListAdaptations,
                                  v1::ListAdaptationsRequest(),
                                  &v1::ListAdaptationsResponse::adaptations);
 }
@@ -61,7 +61,7 @@ Status Client::DeleteAdaptation(const std::string& id) {
   v1::DeleteAdaptationRequest request;
   METAEKF_CLIENT_ASSIGN_OR_RETURN(*request.mutable_name(), Resource("adaptations", id));
   google::protobuf::Empty response;
-  return impl_->Call(impl_->adaptations, &Stub::DeleteAdaptation, request, &response);
+  return impl_->Call(impl_->adaptations, &AdaptationService::Stub::DeleteAdaptation, request, &response);
 }
 
 }  // namespace metaekf::client

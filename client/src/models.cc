@@ -7,7 +7,7 @@
 namespace metaekf::client {
 namespace {
 
-using Stub = v1::ModelService::Stub;
+using v1::ModelService;
 
 constexpr size_t kChunkBytes = 512 * 1024;
 
@@ -26,7 +26,7 @@ std::string Sha256Hex(const std::string& bytes) {
 }  // namespace
 
 Result<std::vector<Model>> Client::ListModels() {
-  return impl_->List<Model>(impl_->models, &Stub::ListModels, v1::ListModelsRequest(),
+  return impl_->List<Model>(impl_->models, &ModelService::Stub::ListModels, v1::ListModelsRequest(),
                             &v1::ListModelsResponse::models);
 }
 
@@ -34,14 +34,14 @@ Result<Model> Client::GetModel(const std::string& model) {
   v1::GetModelRequest request;
   METAEKF_CLIENT_ASSIGN_OR_RETURN(*request.mutable_name(), BareModelResource(model));
   v1::Model response;
-  METAEKF_CLIENT_RETURN_IF_ERROR(impl_->Call(impl_->models, &Stub::GetModel, request, &response));
+  METAEKF_CLIENT_RETURN_IF_ERROR(impl_->Call(impl_->models, &ModelService::Stub::GetModel, request, &response));
   return FromProto(response);
 }
 
 Result<std::vector<ModelVersion>> Client::ListModelVersions(const std::string& model) {
   v1::ListModelVersionsRequest request;
   METAEKF_CLIENT_ASSIGN_OR_RETURN(*request.mutable_parent(), BareModelResource(model));
-  return impl_->List<ModelVersion>(impl_->models, &Stub::ListModelVersions, request,
+  return impl_->List<ModelVersion>(impl_->models, &ModelService::Stub::ListModelVersions, request,
                                    &v1::ListModelVersionsResponse::model_versions);
 }
 
@@ -50,7 +50,7 @@ Result<ModelVersion> Client::GetModelVersion(const std::string& model) {
   METAEKF_CLIENT_ASSIGN_OR_RETURN(*request.mutable_name(), ModelResource(model));
   v1::ModelVersion response;
   METAEKF_CLIENT_RETURN_IF_ERROR(
-      impl_->Call(impl_->models, &Stub::GetModelVersion, request, &response));
+      impl_->Call(impl_->models, &ModelService::Stub::GetModelVersion, request, &response));
   return FromProto(response);
 }
 
@@ -109,21 +109,21 @@ Status Client::SetModelAlias(const std::string& model, const std::string& alias,
   }
   request.mutable_alias()->set_version(version);
   v1::ModelAlias response;
-  return impl_->Call(impl_->models, &Stub::SetModelAlias, request, &response);
+  return impl_->Call(impl_->models, &ModelService::Stub::SetModelAlias, request, &response);
 }
 
 Status Client::DeleteModelAlias(const std::string& model) {
   v1::DeleteModelAliasRequest request;
   METAEKF_CLIENT_ASSIGN_OR_RETURN(*request.mutable_name(), ModelResource(model));
   google::protobuf::Empty response;
-  return impl_->Call(impl_->models, &Stub::DeleteModelAlias, request, &response);
+  return impl_->Call(impl_->models, &ModelService::Stub::DeleteModelAlias, request, &response);
 }
 
 Status Client::DeleteModelVersion(const std::string& model) {
   v1::DeleteModelVersionRequest request;
   METAEKF_CLIENT_ASSIGN_OR_RETURN(*request.mutable_name(), ModelResource(model));
   google::protobuf::Empty response;
-  return impl_->Call(impl_->models, &Stub::DeleteModelVersion, request, &response);
+  return impl_->Call(impl_->models, &ModelService::Stub::DeleteModelVersion, request, &response);
 }
 
 }  // namespace metaekf::client

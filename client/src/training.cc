@@ -4,7 +4,7 @@
 namespace metaekf::client {
 namespace {
 
-using Stub = v1::TrainingService::Stub;
+using v1::TrainingService;
 
 void Update(const v1::WatchJobResponse& response, Job& job) {
   job.state = FromProto(response.state());
@@ -50,12 +50,12 @@ Result<Job> Client::GetJob(const std::string& id) {
   v1::GetJobRequest request;
   METAEKF_CLIENT_ASSIGN_OR_RETURN(*request.mutable_name(), Resource("jobs", id));
   v1::Job response;
-  METAEKF_CLIENT_RETURN_IF_ERROR(impl_->Call(impl_->training, &Stub::GetJob, request, &response));
+  METAEKF_CLIENT_RETURN_IF_ERROR(impl_->Call(impl_->training, &TrainingService::Stub::GetJob, request, &response));
   return FromProto(response);
 }
 
 Result<std::vector<Job>> Client::ListJobs() {
-  return impl_->List<Job>(impl_->training, &Stub::ListJobs, v1::ListJobsRequest(),
+  return impl_->List<Job>(impl_->training, &TrainingService::Stub::ListJobs, v1::ListJobsRequest(),
                           &v1::ListJobsResponse::jobs);
 }
 
@@ -85,7 +85,7 @@ Result<Job> Client::CancelJob(const std::string& id) {
   METAEKF_CLIENT_ASSIGN_OR_RETURN(*request.mutable_name(), Resource("jobs", id));
   v1::Job response;
   METAEKF_CLIENT_RETURN_IF_ERROR(
-      impl_->Call(impl_->training, &Stub::CancelJob, request, &response));
+      impl_->Call(impl_->training, &TrainingService::Stub::CancelJob, request, &response));
   return FromProto(response);
 }
 

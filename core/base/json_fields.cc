@@ -2,6 +2,7 @@
 
 #include <cmath>
 #include <limits>
+#include <nlohmann/json.hpp>
 
 #include "absl/strings/str_cat.h"
 #include "absl/strings/str_join.h"
@@ -28,6 +29,8 @@ JsonFields::JsonFields(const nlohmann::json& object, std::string path) : object_
     object_ = &EmptyObject();
   }
 }
+
+bool JsonFields::Has(const std::string& name) const { return object_->contains(name); }
 
 const nlohmann::json* JsonFields::Find(const std::string& name) {
   read_.insert(name);

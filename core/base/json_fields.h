@@ -2,7 +2,7 @@
 
 #include <cstdint>
 #include <map>
-#include <nlohmann/json.hpp>
+#include <nlohmann/json_fwd.hpp>
 #include <set>
 #include <string>
 #include <utility>
@@ -21,7 +21,7 @@ class JsonFields {
   /// `object` must outlive the reader and those made from it.
   JsonFields(const nlohmann::json& object, std::string path);
 
-  bool Has(const std::string& name) const { return object_->contains(name); }
+  bool Has(const std::string& name) const;
   double Number(const std::string& name, double default_value, double low, double high);
   int64_t Integer(const std::string& name, int64_t default_value, int64_t low, int64_t high);
   bool Bool(const std::string& name, bool default_value);

@@ -1,6 +1,7 @@
 #include "core/experiments/bouc_wen_learners.h"
 
 #include <algorithm>
+#include <nlohmann/json.hpp>
 
 #include "absl/strings/str_cat.h"
 #include "core/base/status.h"

@@ -1,5 +1,7 @@
 #include "core/experiments/localization_learners.h"
 
+#include <nlohmann/json.hpp>
+
 #include "absl/strings/str_cat.h"
 
 namespace metaekf::experiments {

@@ -1,5 +1,7 @@
 #include "core/experiments/vapor_compression_learners.h"
 
+#include <nlohmann/json.hpp>
+
 #include "absl/strings/str_cat.h"
 #include "core/sim/vapor_compression.h"
 

@@ -282,7 +282,7 @@ TailErrors ArxErrors(const Trajectory& head, const Trajectory& tail, int64_t war
 
 absl::StatusOr<Problem> Pose(const Bundle& bundle, const Trajectory& context, const AdaptationOptions& options) {
   const nssm::ModelSpec& spec = bundle.model.spec();
-  METAEKF_ASSIGN_OR_RETURN(const TrainingSpec training, ReadTrainingSpec(bundle.training));
+  METAEKF_ASSIGN_OR_RETURN(const TrainingSpec training, ReadTrainingSpec(*bundle.training));
   METAEKF_RETURN_IF_ERROR(nssm::CheckChannels(bundle, context, !spec.is_case_one()));
   if (spec.fits_start() && (options.method == AdaptationMethod::kGradientDescent || options.method == AdaptationMethod::kAdam)) {
     return absl::InvalidArgumentError("method: the start of the model is fitted, so it adapts by Levenberg–Marquardt (map) or from scratch");
@@ -389,7 +389,7 @@ bool BetterInFreeRun(const TailErrors& a, const TailErrors& b) {
 }
 
 absl::StatusOr<AdaptationOptions> DefaultAdaptation(const Bundle& bundle, std::optional<AdaptationMethod> method) {
-  const absl::StatusOr<TrainingSpec> training = ReadTrainingSpec(bundle.training);
+  const absl::StatusOr<TrainingSpec> training = ReadTrainingSpec(*bundle.training);
   if (!training.ok()) {
     return absl::FailedPreconditionError(
         absl::StrCat("the model does not say how it was trained: ", std::string(training.status().message())));

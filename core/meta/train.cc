@@ -4,6 +4,7 @@
 #include <cmath>
 #include <iterator>
 #include <limits>
+#include <nlohmann/json.hpp>
 
 #include "core/base/numbers.h"
 #include "core/base/status.h"
@@ -263,8 +264,9 @@ absl::StatusOr<Bundle> Train(const TrainingSpec& given_spec, const Dataset& flee
   bundle.sample_period_s = spec.sample_period_s;
   bundle.names = {used.input_names, used.output_names, used.state_names};
   bundle.training = ToJson(spec);
-  bundle.provenance = {{"systems", fleet.trajectories.size()}, {"iterations", state.iteration}};
-  if (std::isfinite(state.best_validation_loss)) bundle.provenance["validation_loss"] = state.best_validation_loss;
+  nlohmann::json provenance = {{"systems", fleet.trajectories.size()}, {"iterations", state.iteration}};
+  if (std::isfinite(state.best_validation_loss)) provenance["validation_loss"] = state.best_validation_loss;
+  bundle.provenance = std::move(provenance);
   const Judges judges = ChooseJudges(spec, split);
   METAEKF_ASSIGN_OR_RETURN(bundle.noise, NoiseOfAdaptedModels(bundle, spec, Pick(used.trajectories, judges.systems), judges, executor));
   return bundle;

@@ -1,5 +1,7 @@
 #include "core/meta/training_spec.h"
 
+#include <nlohmann/json.hpp>
+
 #include "core/base/status.h"
 #include "core/meta/linear_state_start.h"
 

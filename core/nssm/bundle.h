@@ -1,11 +1,11 @@
 #pragma once
 
-#include <nlohmann/json.hpp>
 #include <optional>
 #include <string>
 #include <vector>
 
 #include "absl/status/statusor.h"
+#include "core/base/json_value.h"
 #include "core/data/normaliser.h"
 #include "core/nssm/model.h"
 #include "core/nssm/prior.h"
@@ -51,9 +51,9 @@ struct Bundle {
   std::optional<GaussianPrior> prior;
   std::optional<GaussianPosterior> posterior;  ///< of a model adapted by Levenberg–Marquardt
   /// Specification of the training, as JSON: `adapt` takes its defaults from it.
-  nlohmann::json training;
+  base::JsonValue training;
   /// Where the model comes from: seed, data digest, losses.
-  nlohmann::json provenance;
+  base::JsonValue provenance;
 };
 
 /// Checks that a trajectory has the channels the model needs, and as many.

@@ -1,6 +1,7 @@
 #include "core/nssm/model_file.h"
 
 #include <algorithm>
+#include <nlohmann/json.hpp>
 #include <optional>
 
 #include "absl/strings/str_join.h"
@@ -270,8 +271,8 @@ std::string WriteModelFile(const Bundle& bundle) {
         {"process_bias", ToJson(bundle.noise.process_bias)},
         {"measurement_bias", ToJson(bundle.noise.measurement_bias)},
         {"parameter_std", bundle.noise.parameter_std}}},
-      {"training", bundle.training},
-      {"provenance", bundle.provenance},
+      {"training", *bundle.training},
+      {"provenance", *bundle.provenance},
   };
   file.metadata[kMetadataKey] = description.dump();
   return WriteSafetensors(file);

@@ -1,6 +1,7 @@
 #include "core/nssm/spec.h"
 
 #include <algorithm>
+#include <nlohmann/json.hpp>
 #include <set>
 
 #include "core/base/status.h"

@@ -1,5 +1,7 @@
 #include "server/convert/models.h"
 
+#include <nlohmann/json.hpp>
+
 #include "absl/strings/str_cat.h"
 #include "server/convert/channels.h"
 #include "server/convert/json.h"
@@ -12,7 +14,7 @@ namespace metaekf::server {
 std::string VersionMetadata(const nssm::Bundle& bundle, const std::string& training_job) {
   v1::ModelVersion version;
   // A file may come without its training, or with that of a later version.
-  auto training = ToTrainingSpecMessage(bundle.training);
+  auto training = ToTrainingSpecMessage(*bundle.training);
   if (!training.ok() || !training->has_model()) {
     training = ToTrainingSpecMessage({{"model", nssm::ToJson(bundle.model.spec())}});
   }
@@ -20,8 +22,8 @@ std::string VersionMetadata(const nssm::Bundle& bundle, const std::string& train
   *version.mutable_channels() = ToMessage(bundle.names);
   version.set_sample_period_s(bundle.sample_period_s);
   version.set_parameter_count(bundle.parameters.size());
-  const auto loss = bundle.provenance.find("validation_loss");
-  if (loss != bundle.provenance.end() && loss->is_number()) {
+  const auto loss = bundle.provenance->find("validation_loss");
+  if (loss != bundle.provenance->end() && loss->is_number()) {
     version.set_validation_loss(loss->get<double>());
   }
   version.set_training_job(training_job);

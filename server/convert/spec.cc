@@ -1,5 +1,7 @@
 #include "server/convert/spec.h"
 
+#include <nlohmann/json.hpp>
+
 #include "absl/strings/str_cat.h"
 #include "core/base/json_fields.h"
 #include "core/base/status.h"

@@ -1,6 +1,7 @@
 #include "server/serving/model_cache.h"
 
 #include <algorithm>
+#include <nlohmann/json.hpp>
 #include <optional>
 
 #include "core/base/status.h"

@@ -1,5 +1,6 @@
 // See README.md beside this file.
 
+#include <nlohmann/json.hpp>
 #include <sys/resource.h>
 
 #include <algorithm>

@@ -4,6 +4,7 @@
 #include <filesystem>
 #include <fstream>
 #include <google/protobuf/text_format.h>
+#include <nlohmann/json.hpp>
 #include <sstream>
 
 #include "core/nssm/model_file.h"
@@ -48,7 +49,7 @@ TEST(SpecsTest, EveryShippedModelIsTrainedAsItsSpecificationSays) {
     ASSERT_TRUE(spec.ok()) << entry.path() << ": " << spec.status();
     const auto bundle = nssm::ReadModelFile(Contents(entry.path()));
     ASSERT_TRUE(bundle.ok()) << entry.path() << ": " << bundle.status();
-    nlohmann::json expected = meta::ToJson(*spec), trained = meta::ToJson(*meta::ReadTrainingSpec(bundle->training));
+    nlohmann::json expected = meta::ToJson(*spec), trained = meta::ToJson(*meta::ReadTrainingSpec(*bundle->training));
     for (nlohmann::json* one : {&expected, &trained}) {  // what comes from the data
       for (const char* size : {"input_size", "output_size", "state_size"}) (*one)["model"].erase(size);
       one->erase("sample_period_s");

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <filesystem>
 #include <fstream>
+#include <nlohmann/json.hpp>
 #include <sstream>
 
 #include "core/base/executor.h"
@@ -47,7 +48,7 @@ TEST(ZooTest, EveryModelLoadsAndSaysHowItWasMade) {
     const auto bundle = nssm::ReadModelFile(Contents(entry.path()));
     ASSERT_TRUE(bundle.ok()) << entry.path() << ": " << bundle.status();
     EXPECT_TRUE(meta::DefaultAdaptation(*bundle).ok()) << entry.path();
-    EXPECT_TRUE(bundle->training.contains("seed")) << entry.path();
+    EXPECT_TRUE(bundle->training->contains("seed")) << entry.path();
   }
   EXPECT_GE(models, 1);
 }

@@ -8,7 +8,7 @@ metaekf_library(server_test_support
   SOURCES server/support/client.cc server/support/tiny_models.cc
   DEPS metaekf::core_nssm metaekf::proto_messages metaekf::server metaekf::server_convert
     metaekf::server_store
-  PRIVATE_DEPS metaekf::proto GTest::gtest)
+  PRIVATE_DEPS metaekf::core_test_support metaekf::proto GTest::gtest)
 target_compile_definitions(metaekf_server_test_support
   INTERFACE METAEKFD_BINARY="$<TARGET_FILE:metaekfd>")
 add_dependencies(metaekf_server_test_support metaekfd)  # the workers of jobs

@@ -1,7 +1,6 @@
 #pragma once
 
-#include <gtest/gtest.h>
-
+#include <Eigen/Core>
 #include <string>
 
 #include "core/nssm/bundle.h"
@@ -9,38 +8,9 @@
 namespace metaekf::support {
 
 /// A bundle whose normalised units are the physical ones: parameters 0, covariances I, channels u1…, y1…, x1….
-inline nssm::Bundle UnitBundle(nssm::Model model) {
-  const nssm::ModelSpec spec = model.spec();
-  const auto unit = [](int32_t n) { return data::ChannelScaling{Eigen::VectorXd::Zero(n), Eigen::VectorXd::Ones(n)}; };
-  const auto names = [](const std::string& letter, int32_t n) {
-    std::vector<std::string> result;
-    for (int32_t i = 1; i <= n; ++i) result.push_back(letter + std::to_string(i));
-    return result;
-  };
-  const int32_t n = spec.is_case_one() ? spec.latent_size : spec.state_size;
-  nssm::Bundle bundle{.model = std::move(model)};
-  bundle.parameters.assign(static_cast<size_t>(bundle.model.layout().size()), 0.0);
-  bundle.normaliser = {unit(spec.input_size), unit(spec.output_size), unit(spec.state_size)};
-  bundle.sample_period_s = 0.1;
-  bundle.names = {names("u", spec.input_size), names("y", spec.output_size), names("x", spec.state_size)};
-  bundle.noise = {Eigen::MatrixXd::Identity(n, n), Eigen::MatrixXd::Identity(spec.output_size, spec.output_size),
-                  Eigen::MatrixXd::Identity(n, n)};
-  bundle.training = nlohmann::json::object();
-  bundle.provenance = nlohmann::json::object();
-  return bundle;
-}
+nssm::Bundle UnitBundle(nssm::Model model);
 
 /// Sets one tensor, given as out × in.
-inline void SetWeight(const std::string& name, const Eigen::MatrixXd& weight, nssm::Bundle* bundle) {
-  for (const nn::Tensor& tensor : bundle->model.layout().tensors()) {
-    if (tensor.name != name) continue;
-    ASSERT_EQ(weight.rows(), tensor.out);
-    ASSERT_EQ(weight.cols(), tensor.in);
-    Eigen::Map<Eigen::Matrix<double, -1, -1, Eigen::RowMajor>>(bundle->parameters.data() + tensor.offset, tensor.out,
-                                                               tensor.in) = weight;
-    return;
-  }
-  FAIL() << "no tensor " << name;
-}
+void SetWeight(const std::string& name, const Eigen::MatrixXd& weight, nssm::Bundle* bundle);
 
 }  // namespace metaekf::support

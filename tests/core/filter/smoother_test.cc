@@ -7,6 +7,7 @@
 
 #include "tests/core/filter/linear_filter.h"
 #include "tests/core/nssm/random_models.h"
+#include "tests/support/bundles.h"
 
 namespace metaekf::filter {
 namespace {

@@ -6,6 +6,7 @@
 #include "core/filter/replay.h"
 #include "tests/core/filter/linear_filter.h"
 #include "tests/core/nssm/random_models.h"
+#include "tests/support/bundles.h"
 
 namespace metaekf::filter {
 namespace {

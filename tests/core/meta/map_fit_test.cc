@@ -5,6 +5,7 @@
 #include <Eigen/Cholesky>
 #include <Eigen/QR>
 
+#include "core/base/rng.h"
 #include "tests/core/nssm/random_models.h"
 
 namespace metaekf::meta {

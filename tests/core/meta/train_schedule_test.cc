@@ -29,7 +29,7 @@ TEST(TrainScheduleTest, CurvatureRatesBeginAtTheScaleOfTheLoss) {
     spec.iterations = 1;
     const nssm::Bundle bundle = *Train(spec, Fleet(10, 80, 1), nullptr, base::CallingThread(), nullptr);
     // What is kept are the rates themselves, not what they began as.
-    EXPECT_FALSE(ReadTrainingSpec(bundle.training)->inner_loop.curvature_rates);
+    EXPECT_FALSE(ReadTrainingSpec(*bundle.training)->inner_loop.curvature_rates);
     return DefaultAdaptation(bundle)->inner_loop.tensor_rates;
   };
   const std::map<std::string, double> of_one = rates(1), of_hundred = rates(100);
@@ -50,7 +50,7 @@ TEST(TrainScheduleTest, CurvatureRatesLeaveRoomForEachOther) {
   spec.validation_share = 0;
   const Dataset fleet = Fleet(1, 80, 1);
   const nssm::Bundle bundle = *Train(spec, fleet, nullptr, base::CallingThread(), nullptr);
-  const TrainingSpec trained = *ReadTrainingSpec(bundle.training);
+  const TrainingSpec trained = *ReadTrainingSpec(*bundle.training);
   const nssm::LossShape shape = *nssm::ShapeOfLoss(trained.model, trained.loss, spec.context_samples);
   const MetaGradient<double> gradient(bundle.model, trained, shape, shape,
                                       *nn::ParseMask(spec.inner_loop.adapted_mask, bundle.model.layout()));

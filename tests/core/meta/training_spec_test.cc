@@ -1,6 +1,7 @@
 #include "core/meta/training_spec.h"
 
 #include <gtest/gtest.h>
+#include <nlohmann/json.hpp>
 
 namespace metaekf::meta {
 namespace {

@@ -4,6 +4,7 @@
 
 #include <limits>
 
+#include "core/base/rng.h"
 #include "tests/core/nssm/random_models.h"
 
 namespace metaekf::nssm {

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <numbers>
 
+#include "core/base/rng.h"
 #include "tests/core/nssm/random_models.h"
 #include "tests/support/bundles.h"
 

@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include "core/base/rng.h"
 #include "tests/core/nssm/random_models.h"
 
 namespace metaekf::nssm {

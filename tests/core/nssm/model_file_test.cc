@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cstring>
+#include <nlohmann/json.hpp>
 
 #include "core/nssm/safetensors.h"
 #include "tests/core/nssm/random_models.h"
@@ -17,7 +18,7 @@ Bundle SomeBundle(const ModelCase& c) {
   bundle.parameters = RandomParameters(bundle.model, 3);
   RoundToPrecision(c.model.precision, &bundle.parameters);
   bundle.normaliser.outputs.mean.setConstant(0.1);
-  bundle.training = {{"seed", 3}};
+  bundle.training = nlohmann::json{{"seed", 3}};
   return bundle;
 }
 
@@ -32,7 +33,7 @@ TEST(ModelFileTest, EveryKindOfModelReadsBackExactly) {
       EXPECT_EQ(back->parameters, bundle.parameters);
       EXPECT_EQ(back->normaliser.outputs.mean, bundle.normaliser.outputs.mean);
       EXPECT_EQ(back->noise.process, bundle.noise.process);
-      EXPECT_EQ(back->training, bundle.training);
+      EXPECT_EQ(*back->training, *bundle.training);
       EXPECT_EQ(WriteModelFile(*back), bytes);
     }
   }

@@ -4,6 +4,7 @@
 
 #include "absl/strings/match.h"
 #include "absl/strings/str_cat.h"
+#include "core/base/rng.h"
 #include "core/filter/filter_model.h"
 #include "tests/core/nssm/random_models.h"
 #include "tests/support/bundles.h"

@@ -7,6 +7,7 @@
 #include <Eigen/Cholesky>
 #include <Eigen/LU>
 
+#include "core/base/rng.h"
 #include "core/nssm/linearise.h"
 #include "tests/core/nssm/random_models.h"
 

@@ -1,6 +1,7 @@
 #include "tests/server/support/tiny_models.h"
 
 #include <cmath>
+#include <nlohmann/json.hpp>
 
 #include "core/meta/training_spec.h"
 #include "server/convert/spec.h"
