@@ -52,7 +52,10 @@ function(metaekf_test source)
   if(CMAKE_CXX_FLAGS MATCHES "-fsanitize")
     math(EXPR ARG_TIMEOUT "10 * ${ARG_TIMEOUT}")
   endif()
-  set_tests_properties(${name} PROPERTIES TIMEOUT ${ARG_TIMEOUT} LABELS "${ARG_LABELS}")
+  # Files of its own, or two presets' tests could not run at the same time.
+  set(directory ${CMAKE_BINARY_DIR}/tests/tmp/${name})
+  file(MAKE_DIRECTORY ${directory})
+  set_tests_properties(${name} PROPERTIES TIMEOUT ${ARG_TIMEOUT} LABELS "${ARG_LABELS}" ENVIRONMENT TEST_TMPDIR=${directory})
   if("slow" IN_LIST ARG_LABELS)
     set_tests_properties(${name} PROPERTIES COST 1000)  # they begin first, so that none is left to run alone
   endif()
